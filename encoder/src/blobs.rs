@@ -1,7 +1,6 @@
 //! A bucket: a shared folder or an object store, with conditional puts.
 //!
-//! Keys are relative to the prefix that the URL names. All calls block; they are made from threads of the program,
-//! never from those of the bucket's own runtime.
+//! Keys are relative to the URL's prefix. All calls block; never call them from the bucket's own runtime threads.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -19,7 +18,7 @@ use tokio::runtime::{Builder, Runtime};
 
 /// Threads that wait for the network.
 const N_THREADS: usize = 2;
-/// Time for which a request that the network broke off is made again, and the pause before that.
+/// How long a broken-off request is retried, and the pause between tries.
 const PATIENCE: Duration = Duration::from_secs(60);
 const RETRY_PAUSE: Duration = Duration::from_millis(300);
 
@@ -39,7 +38,6 @@ pub(crate) enum BlobError {
     Missing { url: String, key: String },
 }
 
-/// A bucket, from a prefix on.
 #[derive(Clone, Debug)]
 pub(crate) struct Bucket {
     store: Arc<dyn ObjectStore>,
@@ -51,8 +49,7 @@ pub(crate) struct Bucket {
 }
 
 impl Bucket {
-    /// Opens the bucket that a URL, or the path of a folder, names. `variables`: of the environment, where object
-    /// stores have their credentials.
+    /// Opens a bucket by URL or path of a folder. `variables`: the environment, with the credentials of object stores.
     ///
     /// # Errors
     /// [`BlobError::Address`]; the bucket itself is first asked by a request.
@@ -61,7 +58,7 @@ impl Bucket {
         variables: impl IntoIterator<Item = (String, String)>,
     ) -> Result<Self, BlobError> {
         let refuse = |problem: String| BlobError::Address { url: address.to_owned(), problem };
-        // Also done by the other users of TLS here; only the first counts.
+        // Other users of TLS install it, too; only the first counts.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let runtime = Builder::new_multi_thread().worker_threads(N_THREADS).enable_all().build()?;
         let runtime = Arc::new(runtime);
@@ -142,14 +139,13 @@ impl Bucket {
         }
     }
 
-    /// Puts an object unless there is one; returns whether there was none. If the answer is lost, the put is made
-    /// again and may find its own object; where it matters who put it, use [`Self::claim`].
+    /// Puts an object unless it exists; returns whether it did not. If the answer is lost, the retry may find the
+    /// caller's own object; where it matters who put it, use [`Self::claim`].
     pub(crate) fn put_new(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         self.put_with(key, bytes.into(), PutMode::Create)
     }
 
-    /// Puts an object unless there is one; returns whether the one that is there has these bytes, which only the
-    /// caller would put.
+    /// Puts an object unless it exists; returns whether the stored one has these bytes, which only the caller puts.
     pub(crate) fn claim(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         let bytes = bytes.into();
         Ok(self.put_new(key, bytes.clone())? || self.require(key)? == bytes)
@@ -159,7 +155,7 @@ impl Bucket {
         self.put_with(key, bytes.into(), PutMode::Overwrite).map(drop)
     }
 
-    /// Returns the names of the objects in a folder, without the folder's name, ascending.
+    /// Names of the objects in a folder, without the folder's name, ascending.
     pub(crate) fn list(&self, folder: &str) -> Result<Vec<String>, BlobError> {
         let at = self.key(folder);
         let listed = self.ask(|| self.store.list(Some(&at)).try_collect::<Vec<_>>());
@@ -174,10 +170,8 @@ impl Bucket {
     }
 }
 
-/// Makes a request, and again where the network broke it off after it was sent.
-///
-/// The client does so itself, but not with a conditional put, which may find its own object: see
-/// [`Bucket::claim`].
+/// Makes a request, and repeats it if the connection breaks. The client does so itself except for a conditional put,
+/// which may find its own object: see [`Bucket::claim`].
 async fn answered<T, F>(request: impl Fn() -> F) -> object_store::Result<T>
 where
     F: Future<Output = object_store::Result<T>>,
@@ -194,7 +188,7 @@ where
     }
 }
 
-/// Returns whether it is unknown if a request reached the server, or its answer came in part.
+/// Returns whether the request may have reached the server, or its answer was cut off.
 fn is_broken_off(error: &object_store::Error) -> bool {
     use HttpErrorKind::{Decode, Interrupted, Request, Timeout};
     let first: &(dyn Error + 'static) = error;

@@ -16,23 +16,22 @@ pub(crate) const NO_CELL: u32 = u32::MAX;
 /// at which a rasteriser drops an opaque one.
 const EXTENT_SIGMAS: f64 = 3.0;
 
-/// A cell with fewer Gaussians is not cut for its width alone: otherwise each stray Gaussian far from the scene
-/// would become a cell.
+/// Cells with fewer Gaussians are not cut for width alone: each stray would become a cell.
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
-/// Where a cell's 10th percentile is this many times that of its 512th Gaussian, it is of other things, as of a sky
-/// around a chair. In ordinary cells it is up to 3 times as large.
+/// A cell holds other things, such as a sky around a chair, where its 10th percentile is this many times that of its
+/// 512th Gaussian. In ordinary cells it is up to 3 times.
 const OTHER_SIZE: f32 = 8.0;
 
-/// A Gaussian larger than its cell, and than this many times what 99 % of the cell's Gaussians measure at most, counts
-/// with the latter in the cell's box: a few huge ones would bring every robot every cell.
+/// A Gaussian is a stray if larger than its cell and than this many times the 99th percentile of sizes. It counts with
+/// the latter in the cell's box: otherwise a few huge ones would bring every robot every cell.
 const STRAY_EXTENT: f64 = 3.0;
 
-/// Most cells of a scene: its manifest, which lists them, has then a quarter of the bytes that robots take.
+/// Most cells of a scene: the manifest, which lists them, then has a quarter of the bytes that robots accept.
 pub(crate) const MAX_CELLS: usize = 65_536;
 
-/// Most cells that are cut only because positions must be exact. More means that the error is finer than the
-/// scene's coordinates; each cell is a file of some kilobytes.
+/// Most cells that are cut only for exact positions; more means that the error is finer than the scene's coordinates.
+/// Each cell is a file of some kilobytes.
 pub(crate) const MAX_CELLS_FOR_PRECISION: usize = 4096;
 
 /// Largest error of a position, per axis.
@@ -57,15 +56,15 @@ impl PositionError {
         }
         let largest = |g: &u32| scene.scales[*g as usize].into_iter().fold(0.0, f32::max);
         let size = f64::from(of_small(part.iter().map(largest).collect())) / 4.0;
-        // Never finer than an input in 32 bits is at the place of the nearest Gaussians: strays do not count.
+        // Never finer than 32-bit input is at the nearest Gaussians; strays do not count.
         let farthest = |g: &u32| scene.means_in_world[*g as usize].abs().max_element() as f32;
         let place = f64::from(of_small(part.iter().map(farthest).collect()));
         size.max(place * f64::from(f32::EPSILON) / 2.0)
     }
 }
 
-/// Returns the 10th percentile of values, or the 512th of those above 0 where it is far smaller: what is a tenth of a
-/// few thousand Gaussians may be a hundredth of as many of another kind. 0 of none.
+/// Returns the 10th percentile, or the 512th positive value where that is far smaller: a tenth of a few thousand
+/// Gaussians may be a hundredth of as many of another kind. 0 without values.
 fn of_small(mut values: Vec<f32>) -> f32 {
     let Some(tenth) = quantile(&mut values, 100, Rank::After) else { return 0.0 };
     values.retain(|value| *value > 0.0);
@@ -92,21 +91,20 @@ impl CellLimits {
     }
 }
 
-/// The places that a cell's positions are rounded to: multiples of `step` from the smallest corner of the means'
-/// box.
+/// The grid to which a cell's positions are rounded: multiples of `step` from the smallest corner of the means' box.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PositionGrid {
     /// World units; 0 along a flat axis.
     pub step: [f64; 3],
-    /// Bits per axis, and 0.
+    /// Bits per axis, then 0.
     pub bits: [u8; 4],
 }
 
 impl PositionGrid {
-    /// Returns the smallest grid over a box whose places are within `error` of every point; `None` if none is.
+    /// Finds the smallest grid over a box with a place within `error` of every point; `None` if there is none.
     fn within(bounds: &Aabb, error: f64) -> Option<Self> {
         let size = bounds.size().to_array();
-        // A decoded position is rounded to a double.
+        // Decoded positions are rounded to doubles.
         let rounding = bounds.min.abs().max(bounds.max.abs()).max_element() * f64::EPSILON;
         let uniform = |bits: u8| [bits; 3];
         let forms = packed_bits(size).into_iter().chain([uniform(16), uniform(32)]);
@@ -129,8 +127,7 @@ fn step(size: f64, bits: u8) -> f64 {
     size / ((1u64 << bits) - 1).max(1) as f64
 }
 
-/// Returns the bits of each axis, 32 in all, that make the coarsest step as fine as possible; `None` for the bits
-/// that mark another form.
+/// Distributes 32 bits over the axes for the finest coarsest step; `None` for the bits that mark another form.
 fn packed_bits(size: [f64; 3]) -> Option<[u8; 3]> {
     let mut bits = [0u8; 3];
     loop {
@@ -149,43 +146,42 @@ fn packed_bits(size: [f64; 3]) -> Option<[u8; 3]> {
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
-    /// Its Gaussians: indices in the input, along a Morton curve.
+    /// Indices in the input, along a Morton curve.
     pub gaussians: Vec<u32>,
     pub(crate) mean_bounds: Aabb,
     /// Box around the extents, but see [`STRAY_EXTENT`].
     pub bounds: Aabb,
-    /// Where its positions may lie.
     pub grid: PositionGrid,
 }
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CellSplit {
-    /// The cells; a cell's id is its index.
+    /// A cell's id is its index.
     pub cells: Vec<Cell>,
-    /// `[N]`: the cell of each Gaussian of the input, or [`NO_CELL`] where it is unusable.
+    /// `[N]`: cell of each input Gaussian; [`NO_CELL`] where it is unusable.
     pub(crate) cell_of_gaussian: Vec<u32>,
-    /// `[N]`: its index within [`Cell::gaussians`].
+    /// `[N]`: index within [`Cell::gaussians`].
     pub local_of_gaussian: Vec<u32>,
     /// Unusable Gaussians.
     pub n_rejected: usize,
-    /// Cells that are smaller than count and width ask for, so that positions keep their error.
+    /// Cells that are smaller than count and width require, for exact positions.
     pub(crate) n_for_precision: usize,
 }
 
 impl CellSplit {
-    /// Returns the limits that decided the split: the same ones cut a scene in the same way.
+    /// The limits that decided the split; equal ones cut a scene equally.
     pub(crate) fn deciding(&self, limits: CellLimits) -> (usize, Option<f64>, Option<PositionError>) {
         let precision = (self.n_for_precision > 0).then_some(limits.position_error);
         (limits.max_gaussians, limits.max_width, precision)
     }
 
-    /// Returns the cell whose Gaussians' means are nearest to a point, the first of such cells.
+    /// Cell of the Gaussian mean nearest to a point; ties go to the first cell.
     pub(crate) fn nearest(&self, point: DVec3) -> Option<usize> {
         let distances = self.cells.iter().map(|cell| cell.mean_bounds.distance_to(point)).enumerate();
         distances.min_by(|a, b| a.1.total_cmp(&b.1)).map(|(cell, _)| cell)
     }
 
-    /// Reserves the partition: each Gaussian's cell, its index there, and its place in the cell's list.
+    /// Reserves the partition: each Gaussian's cell, its index there, and its entry in the cell's list.
     pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
         memory.reserve(
             Phase::Always,
@@ -195,11 +191,11 @@ impl CellSplit {
     }
 }
 
-/// Gaussians from which the halves of a box are worth a thread each.
+/// From this many Gaussians on, the halves of a box are worth a thread each.
 const MIN_GAUSSIANS_TO_SHARE: usize = 1 << 13;
 
-/// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis; a box that is too wide,
-/// or too wide for exact positions, in the middle of it. The result depends only on the Gaussians and the limits.
+/// Splits a scene. A box with too many Gaussians is cut at the median of its longest axis; a box too wide, or too wide
+/// for exact positions, in the middle. The result depends only on the Gaussians and the limits.
 pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
     let indices = (0..scene.len() as u32).into_par_iter();
     let mut indices: Vec<u32> = indices.filter(|i| scene.is_usable(*i as usize)).collect();
@@ -219,8 +215,7 @@ pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
 }
 
 enum Next {
-    /// Cut before this many Gaussians of the part, which is in order; `for_precision`: only exact positions ask
-    /// for it.
+    /// Cut before this many Gaussians of the sorted part; `for_precision`: only exact positions require it.
     Cut {
         at: usize,
         for_precision: bool,
@@ -235,7 +230,7 @@ struct Splitter<'a> {
 }
 
 impl Splitter<'_> {
-    /// Returns the cells of a part, those of its lower half first, and whether precision made each.
+    /// Cells of a part, lower half first, and whether precision made each.
     fn split(self, part: &mut [u32], for_precision: bool) -> Vec<(Cell, bool)> {
         if part.is_empty() {
             return Vec::new();
@@ -258,7 +253,7 @@ impl Splitter<'_> {
         let size = mean_bounds.size();
         let axis = (0..3).max_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(0);
         let coordinate = |i: &u32| scene.means_in_world[*i as usize][axis];
-        // Ties are broken by index: the halves are the same sets every time.
+        // Ties are broken by index, so the halves are always the same.
         let order = |a: &u32, b: &u32| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b));
         if part.len() > limits.max_gaussians.max(1) {
             let middle = part.len() / 2;
@@ -276,7 +271,7 @@ impl Splitter<'_> {
         }
         part.sort_unstable_by(order);
         if let Some(grid) = grid {
-            // Twice the bits for all, unless strays beyond a gap are the reason.
+            // The full form doubles the bits for all; strays beyond a gap are cut off instead.
             let gap = |k: &usize| coordinate(&part[*k]) - coordinate(&part[*k - 1]) > size[axis] / 2.0;
             let at = (1..part.len()).find(gap);
             return at.map_or(Next::Keep(grid), |at| Next::Cut { at, for_precision: true });
@@ -315,7 +310,7 @@ fn finish(scene: &Gaussians, part: &[u32], mean_bounds: Aabb, grid: PositionGrid
     Cell { gaussians: keyed.into_iter().map(|(_, i)| i).collect(), mean_bounds, bounds, grid }
 }
 
-/// Returns a Gaussian's extent along each world axis: `EXTENT_SIGMAS * sqrt(diag(R S² Rᵀ))`.
+/// Extent along each world axis: `EXTENT_SIGMAS * sqrt(diag(R S² Rᵀ))`.
 fn extent(scene: &Gaussians, index: usize) -> DVec3 {
     let [w, x, y, z] = scene.rotations_wxyz[index].map(f64::from);
     let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
@@ -324,7 +319,7 @@ fn extent(scene: &Gaussians, index: usize) -> DVec3 {
     DVec3::new(axis(0), axis(1), axis(2))
 }
 
-/// Returns the place along a Morton (Z-order) curve of 2^21 steps per axis.
+/// Place along a Morton (Z-order) curve of 2^21 steps per axis.
 fn morton(position: DVec3, bounds: &Aabb) -> u64 {
     let step = (bounds.size() / f64::from((1 << 21) - 1)).max(DVec3::splat(f64::MIN_POSITIVE));
     let q = (position - bounds.min) / step;

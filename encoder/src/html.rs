@@ -7,9 +7,9 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
-/// Rows of a table; the rest is counted. A browser takes long to lay out more.
+/// Rows shown of a table; the rest is counted, because browsers are slow with more.
 const MAX_ROWS: usize = 5000;
-/// Inline styles and pictures, and nothing else.
+/// Allows inline styles and pictures, nothing else.
 const POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; img-src data:";
 const STYLE: &str = "\
 :root{color-scheme:light dark;font:15px/1.5 system-ui,sans-serif}\
@@ -29,7 +29,6 @@ pub(crate) struct Page {
     body: String,
 }
 
-/// Returns text with the letters that HTML gives a meaning replaced.
 pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for letter in text.chars() {
@@ -62,7 +61,7 @@ impl Page {
         self.add(format_args!("<p>{}</p>\n", escaped(text)));
     }
 
-    /// Adds a drawing: SVG of this program, which is not escaped.
+    /// Adds unescaped SVG, which this program made.
     pub(crate) fn drawing(&mut self, svg: &str, caption: &str) {
         self.add(format_args!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escaped(caption)));
     }
@@ -74,7 +73,7 @@ impl Page {
         ));
     }
 
-    /// Adds a table; a row of fewer cells than columns ends early. Cells that read as numbers stand right.
+    /// Adds a table; missing cells are left out. Numbers are right-aligned.
     pub(crate) fn table(&mut self, columns: &[&str], rows: &[Vec<String>]) {
         self.body.push_str("<div class=\"wide\" tabindex=\"0\"><table><thead><tr>");
         for column in columns {
@@ -95,8 +94,8 @@ impl Page {
         }
     }
 
-    /// Adds a result as its JSON has it: what is single as one table, then a table for each list of records and
-    /// each record of columns, under its name.
+    /// Adds a result from its JSON: single values as one table, then a titled table for each list of records and each
+    /// record of columns.
     pub(crate) fn value(&mut self, value: &Value) {
         let Some(members) = value.as_object() else { return };
         let is_single = |value: &&Value| !is_list_of_records(value) && !is_of_columns(value);
@@ -113,7 +112,7 @@ impl Page {
         }
     }
 
-    /// Adds the table of a list of records, or of a record of columns, of a result's JSON.
+    /// Adds the table of a list of records, or of a record of columns.
     pub(crate) fn records(&mut self, value: &Value) {
         if let Some(columns) = value.as_object().filter(|_| is_of_columns(value)) {
             let names: Vec<&str> = columns.keys().map(String::as_str).collect();
@@ -150,7 +149,7 @@ fn is_list_of_records(value: &Value) -> bool {
     value.as_array().is_some_and(|list| !list.is_empty() && list.iter().all(Value::is_object))
 }
 
-/// Returns whether a value is a record of lists of the same length.
+/// Whether a value is a record of lists of equal length.
 fn is_of_columns(value: &Value) -> bool {
     let Some(members) = value.as_object() else { return false };
     let mut lens = members.values().map(|column| column.as_array().map(Vec::len));
@@ -158,7 +157,7 @@ fn is_of_columns(value: &Value) -> bool {
     first.is_some() && lens.all(|len| len == first)
 }
 
-/// Returns a value as people read it: numbers of four digits, lists with commas.
+/// Formats a value for people: numbers with four digits, lists with commas.
 fn shown(value: &Value) -> String {
     match value {
         Value::Null => String::new(),

@@ -13,10 +13,10 @@ use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{LoadedScene, RasterError, RasterView};
 
 const BYTES_IN_SHARD: usize = 24;
-/// Landmarks for so many Gaussians: 1.98 bytes a Gaussian; headers of shards add less than 0.02.
+/// One landmark per this many Gaussians: 1.98 bytes a Gaussian; headers of shards add less than 0.02.
 const LANDMARKS: usize = 33;
 const GAUSSIANS: usize = 400;
-/// Widest drawing, pixels: splats show no more of a photo than that.
+/// Widest drawing, pixels: splats show no finer detail of a photo.
 const MAX_DRAWING_WIDTH_PX: u32 = 1600;
 
 #[derive(Debug, thiserror::Error)]
@@ -27,7 +27,6 @@ pub enum LandmarkError {
     Raster(#[from] RasterError),
 }
 
-/// A scene that can be drawn.
 pub struct SceneRenderer<'a>(pub &'a dyn LoadedScene);
 
 impl SceneRenderer<'_> {
@@ -44,15 +43,14 @@ impl Renderer for SceneRenderer<'_> {
     }
 }
 
-/// Reserves the features of all photos and what is made of them, and a photo that is looked at with a drawing of its
-/// view; and what shards carry.
+/// Reserves the features of all photos and the lists made of them, a photo with its drawing, and the shards' content.
 pub(crate) fn reserve(memory: &mut MemoryPlan, n_views: usize, views: &[View], n_gaussians: usize) {
     let photo_px = views.iter().map(ingest::photo_area_px).max().unwrap_or(0);
     let per_observation = size_of::<Observation>() + WORKING_BYTES_PER_OBSERVATION;
     let n_landmarks = (n_gaussians * LANDMARKS / GAUSSIANS).min(n_views * MAX_FEATURES);
     let lists_bytes = n_views * MAX_FEATURES * per_observation + 2 * n_landmarks * size_of::<Landmark>();
     memory.reserve(Phase::Landmarks, "features of all photos", lists_bytes as u64);
-    // The photo, its grey, and five numbers for each pixel of the drawing.
+    // The photo, its grey, and five numbers per pixel of the drawing.
     let photo_bytes = photo_px * (ingest::LOADED_BYTES_PER_PX + 4)
         + photo_px.min(u64::from(MAX_DRAWING_WIDTH_PX).pow(2)) * 20;
     let photo_bytes = photo_bytes + slag_locate::working_bytes(photo_px as usize, 1) as u64;
@@ -60,7 +58,7 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, n_views: usize, views: &[View], n
     memory.reserve(Phase::Always, "landmarks", (n_landmarks * BYTES_IN_SHARD) as u64);
 }
 
-/// Returns the features of a photo that have a place in the scene.
+/// Features of a photo that have a place in the scene.
 pub fn observe(scene: &dyn LoadedScene, number: u16, view: &View) -> Result<MappingView, LandmarkError> {
     let LoadedImage { view, image, .. } = ingest::load_image(view)?;
     let grey = Grey::from_rgb8(image.width() as usize, image.height() as usize, image.as_raw());

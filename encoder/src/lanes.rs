@@ -19,7 +19,7 @@ pub struct GpuLoad {
     pub busy_secs: f64,
 }
 
-/// Things of which each works on one piece at a time, by GPU.
+/// Things by GPU, each for one piece of work at a time.
 #[derive(Debug)]
 pub struct Lanes<T> {
     gpus: Mutex<Vec<Gpu<T>>>,
@@ -36,12 +36,12 @@ struct Gpu<T> {
     busy: Duration,
 }
 
-/// A lane at work; it is free again when this is dropped.
+/// A lane in use; dropping it frees it.
 #[derive(Debug)]
 pub struct Lane<'a, T> {
     lanes: &'a Lanes<T>,
     gpu: usize,
-    /// Present until it is dropped.
+    /// `Some` until dropped.
     held: Option<T>,
 }
 
@@ -67,12 +67,12 @@ impl<T> Lanes<T> {
         self.gpus().iter().map(|gpu| gpu.n_lanes).sum()
     }
 
-    /// Takes a lane, and waits for one where none is free.
+    /// Takes a free lane, or waits for one.
     pub fn take(&self) -> Lane<'_, T> {
         self.take_if_any().expect("a lane")
     }
 
-    /// Takes a lane, and waits for one where none is free; `None` once all GPUs are left out.
+    /// Takes a free lane, or waits for one; `None` once all GPUs are left out.
     pub fn take_if_any(&self) -> Option<Lane<'_, T>> {
         let mut gpus = self.gpus();
         while gpus.iter().any(|gpu| !gpu.is_left_out) {
@@ -85,7 +85,7 @@ impl<T> Lanes<T> {
     }
 
     fn take_of(&self, gpus: &mut [Gpu<T>]) -> Option<Lane<'_, T>> {
-        // The first of equals: `max_by_key` returns the last.
+        // Reversed, because `max_by_key` returns the last of equals.
         let (gpu, of_gpu) = gpus.iter_mut().enumerate().rev().max_by_key(|(_, gpu)| gpu.free.len())?;
         let held = of_gpu.free.pop()?;
         of_gpu.busy_since.get_or_insert_with(Instant::now);
@@ -108,14 +108,14 @@ impl<T> Lane<'_, T> {
         self.lanes.gpus()[self.gpu].number
     }
 
-    /// Leaves the lane's GPU out from now on; returns how many others remain, the first time.
+    /// Leaves the lane's GPU out from now on; the first time, returns how many others remain.
     pub fn leave_out(self) -> Option<usize> {
         let mut gpus = self.lanes.gpus();
         gpus[self.gpu].free.clear();
         let was_left_out = std::mem::replace(&mut gpus[self.gpu].is_left_out, true);
         let n_others = gpus.iter().filter(|gpu| !gpu.is_left_out).count();
         drop(gpus);
-        // Those that wait must see that there may be no GPU.
+        // Waiting threads must see that there may be no GPU.
         self.lanes.freed.notify_all();
         (!was_left_out).then_some(n_others)
     }
@@ -152,8 +152,7 @@ impl<T> Drop for Lane<'_, T> {
 mod tests {
     use super::*;
 
-    /// Two GPUs of two lanes: work alternates between them, a fifth piece waits, and a GPU is busy while one lane
-    /// is.
+    /// Two GPUs of two lanes: work alternates, a fifth piece waits, and a GPU is busy while any lane is.
     #[test]
     fn work_goes_to_the_gpu_with_the_most_free_lanes() {
         let lanes = Lanes::new([(4, vec!['a', 'b']), (7, vec!['c', 'd'])]);
@@ -166,7 +165,7 @@ mod tests {
             held.remove(1);
             assert_eq!(waiting.join().expect("no panic"), 7);
         });
-        // GPU 4 stays at work, GPU 7 has one lane at work.
+        // GPU 4 stays busy, GPU 7 has one busy lane.
         let before = lanes.loads();
         held.retain(|lane| lane.gpu() == 4);
         let [four, seven] = &lanes.loads()[..] else { panic!("two GPUs") };

@@ -15,12 +15,11 @@ pub(crate) use hits::points_ply;
 pub use hits::{Hit, check_scene, located};
 use slag_math::dot;
 
-/// Cosines of every Gaussian of the input with a query.
 #[derive(Clone, Debug)]
 pub struct Scores {
-    /// `[N]` in the order of the input file; NaN where a Gaussian has no evidence or is in no cell.
+    /// `[N]` in input order; NaN for a Gaussian without evidence or cell.
     pub cosines: Vec<f32>,
-    /// `[N]`: the evidence, the blending weight under masks summed over all views.
+    /// `[N]`: evidence, the blending weight under masks summed over all views.
     pub total_weights: Vec<f32>,
 }
 
@@ -42,7 +41,7 @@ pub enum QueryError {
     NoObjects,
 }
 
-/// Returns the profiles that a command needs beside any others: exact shards tell which Gaussian is which.
+/// The profiles that a command needs beside any others: exact shards tell which Gaussian is which.
 fn with_exact(profile: Profile) -> String {
     match profile {
         Profile::Exact => "exact".into(),
@@ -89,9 +88,8 @@ fn check_dim(reader: &StoreReader, query: &[f32]) -> Result<(), QueryError> {
     }
 }
 
-/// Scores every Gaussian as a profile's shards decode it: what a robot that holds them knows.
-///
-/// Total weights are left at zero: shards do not keep them.
+/// Scores every Gaussian as decoded from a profile's shards, as on a robot that holds them. Total weights are zero:
+/// shards do not keep them.
 pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -> Result<Scores, QueryError> {
     check_dim(reader, query)?;
     let mut scores = Scores::unknown(reader);
@@ -99,7 +97,7 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
         let cell_id = cell.cell_id;
         let stored = shard_of(reader, cell, profile)?;
         let shard = stored.view();
-        // All profiles have the same order, so the exact one knows the indices of those encoded without them.
+        // All profiles have the same order, so the exact shard tells the indices.
         let exact = match shard.has_input_indices() {
             true => None,
             false => Some(shard_of(reader, cell, Profile::Exact)?),
@@ -119,23 +117,23 @@ fn shard_of(reader: &StoreReader, cell: &CellRecord, profile: Profile) -> Result
     Ok(reader.read_shard(cell.shards.get(&profile).ok_or(missing)?)?)
 }
 
-/// Share of the object's score in those of its Gaussians. On generated scenes anything up to a third changed
-/// little, and objects alone were worse; on the labelled house, with given masks, more was better.
+/// Share of an object's score in its Gaussians' scores. On generated scenes, up to a third changed little, and objects
+/// alone were worse; on the labelled house with given masks, more was better.
 const OBJECT_SHARE: f32 = 0.3;
 
-/// Returns the score, or the threshold of scores, of a Gaussian in an object.
+/// Score, or threshold of scores, of a Gaussian in an object.
 pub fn mixed(of_gaussian: f32, of_object: f32) -> f32 {
     (1.0 - OBJECT_SHARE) * of_gaussian + OBJECT_SHARE * of_object
 }
 
-/// The objects of a published scene, as robots receive them.
+/// A published scene's objects, as robots receive them.
 #[derive(Clone, Debug)]
 pub struct PublishedObjects {
-    /// `[N]` in the order of the input file: each Gaussian's object, or [`NONE`].
+    /// `[N]` in input order: the object, or [`NONE`].
     pub object_of: Vec<u32>,
-    /// Of each object, ascending.
+    /// By object, ascending.
     pub ids: Vec<u64>,
-    /// Mean and spread of the text bank's scores over them.
+    /// Of the text bank's scores over the objects.
     pub calibration: Calibration,
     /// `[n][n_vectors][dim]`.
     vectors: Vec<f32>,
@@ -144,7 +142,7 @@ pub struct PublishedObjects {
 }
 
 impl PublishedObjects {
-    /// Reads the objects; `None` if the scene has no objects, or no exact shards to identify Gaussians by.
+    /// `None` if the scene has no objects, or no exact shards to identify Gaussians by.
     pub fn find(reader: &StoreReader) -> Result<Option<Self>, QueryError> {
         match Self::read(reader) {
             Err(QueryError::NoObjects | QueryError::NoShard { .. }) => Ok(None),
@@ -152,7 +150,7 @@ impl PublishedObjects {
         }
     }
 
-    /// Reads the objects from the exact shards.
+    /// Takes exact shards.
     pub fn read(reader: &StoreReader) -> Result<Self, QueryError> {
         let manifest = reader.manifest();
         let dim = manifest.encoder.dim as usize;
@@ -196,14 +194,14 @@ impl PublishedObjects {
         })
     }
 
-    /// Returns the score of each object with a unit query, see [`slag_common::objects::object_score`].
+    /// Score of each object with a unit query, see [`slag_common::objects::object_score`].
     pub fn scores(&self, query: &[f32]) -> Vec<f32> {
         let cosines: Vec<f32> = self.vectors.chunks_exact(self.dim).map(|v| dot(v, query)).collect();
         cosines.chunks_exact(self.n_vectors).map(object_score).collect()
     }
 
-    /// Mixes the object's score into that of each of its Gaussians: the thing is judged as a whole, and where its
-    /// shape is wrong the Gaussian's own score still decides.
+    /// Mixes each object's score into its Gaussians': the thing is judged as a whole, and where its shape is wrong the
+    /// Gaussian's own score still decides.
     pub fn overlay(&self, of_objects: &[f32], cosines: &mut [f32]) {
         let of_gaussians = cosines.iter_mut().zip(&self.object_of).filter(|(_, object)| **object != NONE);
         of_gaussians.for_each(|(cosine, object)| {
@@ -217,7 +215,7 @@ impl PublishedObjects {
 mod tests {
     use super::*;
 
-    /// Computed by hand: a Gaussian with an object, one without, and one without evidence of its own.
+    /// By hand: a Gaussian with an object, one without, and one without evidence of its own.
     #[test]
     fn gaussians_take_a_part_of_their_objects_score() {
         let objects = PublishedObjects {

@@ -22,7 +22,7 @@ pub(crate) struct Machine {
 impl Machine {
     pub(crate) fn here() -> Self {
         let info = fs_err::read_to_string("/proc/cpuinfo").unwrap_or_default();
-        // Arm boards have no model name, but name themselves.
+        // Arm boards have no model name in /proc/cpuinfo.
         let board = || fs_err::read_to_string("/proc/device-tree/model").ok();
         let board = || board().map(|name| name.trim_end_matches('\0').to_owned());
         Self {
@@ -45,18 +45,17 @@ impl std::fmt::Display for Machine {
     }
 }
 
-/// Returns the value of a `key: value` line.
 fn field(lines: &str, key: &str) -> Option<String> {
     let mut fields = lines.lines().filter_map(|line| line.split_once(':'));
     fields.find(|(found, _)| found.trim() == key).map(|(_, value)| value.trim().to_owned())
 }
 
-/// Returns the load average of the last minute (Linux).
+/// Linux only.
 pub(crate) fn load_1min() -> Option<f64> {
     fs_err::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
 }
 
-/// Returns this process's resident memory (Linux).
+/// Linux only.
 pub(crate) fn resident_bytes() -> Option<u64> {
     let status = fs_err::read_to_string("/proc/self/status").ok()?;
     Some(field(&status, "VmRSS")?.strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
@@ -96,7 +95,7 @@ impl Times {
     }
 }
 
-/// Runs a piece of work and returns its result and duration in milliseconds.
+/// Returns the result and the duration in milliseconds.
 pub(crate) fn timed_ms<T>(work: impl FnOnce() -> T) -> (T, f64) {
     let start = Instant::now();
     let result = work();

@@ -20,12 +20,11 @@ pub(crate) fn sibling(name: &str) -> Result<PathBuf> {
     if path.is_file() { Ok(path) } else { bail!("{} does not exist; build it first", path.display()) }
 }
 
-/// Runs a command and parses the JSON that it prints. Exit code 3 is no error: some inputs were left out, and the
-/// figures count them.
+/// Runs a command and parses its JSON. Exit code 3 is no error: some inputs were left out, and the figures count them.
 pub(crate) fn json_of(command: &mut Command) -> Result<Value> {
     let output = command.stdin(Stdio::null()).output().with_context(|| line(command))?;
     let printed: Option<Value> = serde_json::from_slice(&output.stdout).ok();
-    // The encoder says `message`, the robot's program `detail`.
+    // `message` from the encoder, `detail` from the robot's program.
     let error = |value: &Value| {
         ["message", "detail"].iter().find_map(|key| Some(value["error"][key].as_str()?.to_owned()))
     };
@@ -41,14 +40,14 @@ fn line(command: &Command) -> String {
     words.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(" ")
 }
 
-/// A program's `serve` on a free port, which is stopped when dropped.
+/// A program's `serve` on a free port; stopped when dropped.
 pub(crate) struct Service {
     child: Child,
     pub(crate) url: String,
 }
 
 impl Service {
-    /// Starts the service. `flag`: that of its folder.
+    /// `flag`: the one that takes the folder.
     pub(crate) fn start(program: &Path, flag: &str, folder: &Path) -> Result<Self> {
         let mut command = Command::new(program);
         command.args(["--quiet", "serve", "--listen", "127.0.0.1:0", flag]).arg(folder);
@@ -72,7 +71,7 @@ impl Drop for Service {
     }
 }
 
-/// Copies what `flags` ask for of a store to a cache, as a robot does; returns what the robot's program prints.
+/// Copies parts of a store to a cache, as a robot does; returns the program's JSON.
 pub(crate) fn fetch(store: &Path, cache: &Path, flags: &[&str]) -> Result<Value> {
     let service = Service::start(&sibling("slag-encoder")?, "--store", store)?;
     let mut fetch = Command::new(sibling("slag-edge")?);

@@ -10,9 +10,9 @@ pub(crate) struct SceneFiles {
     pub(crate) dir: PathBuf,
     pub(crate) splat: PathBuf,
     pub(crate) poses: PathBuf,
-    /// The photos, where they are not found beside the poses.
+    /// `None`: the photos are beside the poses.
     pub(crate) images: Option<PathBuf>,
-    /// A picture of ids a photo.
+    /// One picture of ids per photo.
     pub(crate) true_masks: Option<PathBuf>,
 }
 
@@ -41,7 +41,7 @@ impl SceneFiles {
         })
     }
 
-    /// Finds several scenes, whose names must differ: they name files.
+    /// Fails unless names differ, because they name files.
     pub(crate) fn find_all(dirs: &[PathBuf]) -> Result<Vec<Self>> {
         let all = dirs.iter().map(|dir| Self::find(dir)).collect::<Result<Vec<_>>>()?;
         for (at, scene) in all.iter().enumerate() {

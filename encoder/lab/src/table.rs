@@ -39,12 +39,12 @@ impl fmt::Display for Table {
     }
 }
 
-/// Returns a figure with three digits after the point, or a dash.
+/// Three digits after the point, or a dash.
 pub(crate) fn figure(value: Option<f64>) -> String {
     value.map_or("-".into(), |v| format!("{v:.3}"))
 }
 
-/// Returns a share as a percentage, or a dash where there is nothing to take a share of.
+/// A percentage, or a dash if `of` is 0.
 pub(crate) fn percent(n: u64, of: u64) -> String {
     if of == 0 { "-".into() } else { format!("{:.1} %", 100.0 * n as f64 / of as f64) }
 }

@@ -9,8 +9,7 @@ fn in_memory() -> Bucket {
     Bucket { store, prefix: Key::from("scene"), url: "memory://scene".into(), is_local: false, runtime }
 }
 
-/// What every kind of bucket does; `other` is the same bucket, opened again. Those of S3 are tested with real
-/// servers (`tests/fleet/s3.rs`).
+/// Conformance of every kind of bucket; `other` is the same one, opened again. S3: `tests/fleet/s3.rs`, real servers.
 fn conforms(one: &Bucket, other: &Bucket) {
     assert!(one.put_new("jobs/2/plan.json", "first").expect("puts"));
     assert!(!other.put_new("jobs/2/plan.json", "second").expect("puts"), "a conditional put is one for all");
@@ -23,7 +22,7 @@ fn conforms(one: &Bucket, other: &Bucket) {
     assert_eq!(other.len_of("jobs/3").expect("asks"), None);
     let missing = other.require("jobs/3").expect_err("missing").to_string();
     assert!(missing.contains("jobs/3 is missing"), "{missing}");
-    // What is there already is one's own if it has the same bytes.
+    // An existing object is one's own if it has the same bytes.
     assert!(one.claim("end", "mine").expect("claims") && one.claim("end", "mine").expect("claims"));
     assert!(!other.claim("end", "another's").expect("claims"));
 }
@@ -60,7 +59,7 @@ fn a_put_whose_answer_is_lost_is_made_again() {
     let endpoint = format!("http://{}", server.local_addr().expect("an address"));
     let serve = move || {
         let (mut first, _) = server.accept().expect("a request");
-        // What is left unread when a connection is closed resets it.
+        // Unread bytes at closing reset the connection.
         let mut whole = [0; 4096];
         while !first.peek(&mut whole).is_ok_and(|n| whole[..n].ends_with(b"mine")) {}
         first.read_exact(&mut [0]).expect("a request");

@@ -39,7 +39,7 @@ proptest! {
     }
 }
 
-/// Neighbouring doubles that are farther apart than a cell may be wide, in numbers that ask for a cut.
+/// Coordinates whose neighbouring doubles are farther apart than a cell may be wide do not recurse for ever.
 #[test]
 fn cells_narrower_than_coordinates_resolve_end() {
     let large = 1e18f64;
@@ -52,7 +52,7 @@ fn cells_narrower_than_coordinates_resolve_end() {
     assert_eq!(sizes, [MIN_GAUSSIANS_TO_NARROW; 2]);
 }
 
-/// More cells than files are worth are counted, for the caller to refuse.
+/// The caller can refuse: all cells that precision asks for are counted.
 #[test]
 fn errors_finer_than_coordinates_are_counted() {
     let means: Vec<[f64; 3]> = (0..100).map(|i| [f64::from(i) * 1e9, 0.0, 0.0]).collect();
@@ -81,7 +81,7 @@ fn a_sky_costs_the_chair_no_precision() {
     let all: Vec<u32> = (0..scene.len() as u32).collect();
     let error = PositionError::OfSize.of_part(&scene, &all);
     assert!((error - f64::from(0.01f32) / 4.0).abs() < 1e-9, "{error}");
-    // Sizes of 1 to 7 are those of one scene.
+    // Sizes of 1 to 7 belong to one scene.
     let ordinary: Vec<f32> = (0..60_000).map(|i| 1.0 + 6.0 * (i as f32 / 6_000.0).min(1.0)).collect();
     assert_eq!(of_small(ordinary), 7.0);
     // Points without a size say nothing of it, nor do few Gaussians.

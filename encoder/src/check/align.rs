@@ -8,7 +8,7 @@ const MIN_CAMERAS: usize = 3;
 /// Cameras whose second-largest spread is below this share of the largest stand on a line: the rotation about it
 /// is undetermined.
 const MIN_SPREAD: f64 = 1e-3;
-/// Points this near to their mean, relative to the mean's distance from the origin, are one point.
+/// Points nearer than this to their mean, relative to its distance from the origin, coincide.
 const ROUNDING: f64 = 1e-12;
 
 /// The similarity that best maps one set of camera centres to another.
@@ -17,8 +17,7 @@ pub struct Alignment {
     /// From the first set's world to the second's.
     pub similarity: Similarity,
     pub(crate) n_cameras: usize,
-    /// Root mean square of the distances that remain, over the root mean square distance of the second set's
-    /// cameras from their mean.
+    /// RMS of the remaining distances, over the RMS distance of the second set's cameras from their mean.
     pub(crate) residual: f64,
 }
 
@@ -36,13 +35,12 @@ pub enum AlignError {
     Line,
 }
 
-/// Aligns two sets of poses by the centres of the views with the same name, or else the same file name without its
-/// folder and extension.
+/// Aligns two sets of poses by the centres of views with equal names, or else equal file stems.
 pub fn align(from: &[View], to: &[View]) -> Result<Alignment, AlignError> {
     let pairs_by = |key: fn(&View) -> &str| -> Vec<(DVec3, DVec3)> {
         let mut known: std::collections::BTreeMap<&str, Option<&View>> = std::collections::BTreeMap::new();
         for view in to {
-            // A key that two views share tells nothing.
+            // A key shared by two views is ambiguous.
             known.entry(key(view)).and_modify(|known| *known = None).or_insert(Some(view));
         }
         let pair = |view: &View| {
@@ -60,9 +58,8 @@ fn stem(view: &View) -> &str {
     file.rsplit_once('.').map_or(file, |(stem, _)| stem)
 }
 
-/// Returns the similarity that minimises the squared distances between images of the first points and the second.
-///
-/// Umeyama (1991), equations 34 to 43, with the rotation by Horn's quaternion (1987), which is never a reflection.
+/// Least-squares similarity from the first points to the second: Umeyama (1991), equations 34 to 43, with the rotation
+/// by Horn's quaternion (1987), which is never a reflection.
 fn similarity(pairs: &[(DVec3, DVec3)]) -> Result<Alignment, AlignError> {
     let n = pairs.len();
     if n < MIN_CAMERAS {

@@ -13,12 +13,11 @@ use super::suspicion::{at_per_mille, camera_spread, scene_diagonal};
 use super::view::{CheckView, at_width, mean};
 use crate::raster::{LoadedScene, Rasterizer};
 
-/// PSNR from which a splat is drawn too well for a mistake that goes unnoticed, dB.
+/// PSNR from which no mistake goes unnoticed, dB.
 pub(super) const FLAWLESS_DB: f64 = 30.0;
-/// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain
-/// colour, dB.
+/// Least clear gain, of a correction over the given poses or a drawing over a plain colour, dB.
 pub(super) const CLEAR_GAIN_DB: f64 = 3.0;
-/// Gain that counts where the data themselves suggest a mistake, or where nothing but the mistake can cause it, dB.
+/// Least gain where the data suggest a mistake or only the mistake can cause it, dB.
 const SUSPECTED_GAIN_DB: f64 = 0.5;
 /// Factor between neighbouring scales of the sweep, and the largest scale; the smallest is its inverse.
 const SWEEP_STEP: f64 = 1.06;
@@ -26,17 +25,17 @@ const SWEEP_LIMIT: f64 = 64.0;
 /// First step of the refinement: rotation in radians, scale in its logarithm, translation in scene diagonals.
 const FIRST_STEP: f64 = 0.02;
 const HALVINGS: u32 = 6;
-/// The same of a focal length, in its logarithm: half the way to the next that is tried.
+/// The same for a focal length, in its logarithm: half the way to the next one tried.
 const FIRST_FOCAL_STEP: f64 = 0.1;
-/// Gain below which the refinement fits noise of the few small samples, dB: the frame stays as computed.
+/// Smaller gains fit noise of the few small samples, dB: the frame stays as computed.
 const REFINED_GAIN_DB: f64 = 1.0;
 
 const LISTED_TRIALS: usize = 10;
-/// Pairs of a tile and a Gaussian that all trials may draw, beside 1,000 times those of the inputs as given, of which
-/// at most this many a Gaussian and view count: with the cameras in a heap of Gaussians, each is drawn everywhere.
+/// Pairs of a tile and a Gaussian that all trials may draw, beside 1,000 times those of the inputs as given, which
+/// count with at most this many a Gaussian and view: cameras amid the Gaussians draw each of them everywhere.
 const MAX_PAIRS: usize = 200_000_000;
 const MOST_PAIRS_EACH: usize = 2;
-/// Views after which a correction is given up where none of them looks more like its photo than a plain colour.
+/// A correction is given up after this many views if none looks more like its photo than a plain colour.
 const FIRST_VIEWS: usize = 2;
 
 /// A correction that was tried, and the mean PSNR it leads to.
@@ -68,13 +67,11 @@ pub(super) struct Means {
     /// PSNR of photos against their mean colour.
     pub(super) flat_psnr_db: f64,
     pub(super) covered_share: f64,
-    /// Whether more than half of the views fit.
     pub(super) most_fit: bool,
 }
 
 impl Means {
-    /// Returns whether the drawings look like their photos, on average and most of them: a few that are drawn well
-    /// raise an average.
+    /// Both the average and most drawings look like their photos: a few good ones raise an average.
     pub(super) fn fit(&self) -> bool {
         self.average_fits() && self.most_fit
     }
@@ -84,9 +81,9 @@ impl Means {
     }
 }
 
-/// Small copies of some views, and the positions of all cameras.
+/// Small copies of some views, and all camera positions.
 pub(super) struct Samples {
-    /// Indices of the sampled views, ascending.
+    /// Ascending.
     indices: Vec<usize>,
     width_px: u32,
     views: Vec<CheckView>,
@@ -100,7 +97,7 @@ impl Samples {
         Self { indices, width_px, views: Vec::new(), camera_positions: Vec::new() }
     }
 
-    /// Adds the view with this index; its photo is copied only if the view is a sample, or the first of all.
+    /// Adds a view; its photo is copied only if it is a sample or the first view.
     pub(super) fn add(&mut self, index: usize, view: &CheckView) -> Result<(), CheckError> {
         self.camera_positions.push(view.view.camera_from_world.inverse().translation);
         if self.views.is_empty() || self.indices.binary_search(&index).is_ok() {
@@ -109,7 +106,6 @@ impl Samples {
         Ok(())
     }
 
-    /// Searches for the correction with which the samples match.
     pub(super) fn diagnose(
         &self,
         scene: &Gaussians,
@@ -150,8 +146,8 @@ impl Samples {
     }
 }
 
-/// Returns the mean PSNR of the samples, dB, and how many pairs of a tile and a Gaussian were drawn. Ends after
-/// `n_first` samples if none of them looks more like its photo than a plain colour.
+/// Mean PSNR of the samples, dB, and the number of drawn pairs of a tile and a Gaussian. Ends after `n_first` samples
+/// if none of them looks more like its photo than a plain colour.
 fn mean_psnr_db(
     samples: &[CheckView],
     scene: &dyn LoadedScene,
@@ -180,15 +176,14 @@ struct Search<'a> {
     rasterizer: &'a dyn Rasterizer,
     flat_psnr_db: f64,
     given_psnr_db: f64,
-    /// Pairs that may yet be drawn.
     pairs_left: Cell<usize>,
     suspected: Vec<Mistake>,
 }
 
 impl Search<'_> {
-    /// Tries what is suspected and what goes unnoticed, then, where drawings and photos differ, common mistakes and
-    /// frames, then a sweep of scales, until one explains the photos. Returns all trials, best first; a frame of
-    /// nerfstudio's defaults or a scale among the best is refined.
+    /// Tries what is suspected and what goes unnoticed; where drawings and photos differ, also common mistakes, frames
+    /// and a sweep of scales, until one explains the photos. Returns all trials, best first; a frame of nerfstudio's
+    /// defaults or a scale among the best is refined.
     fn run(&self, frames: &[FrameCandidate], fit: bool) -> Result<Vec<Trial>, CheckError> {
         let mut tried = Vec::new();
         self.try_all(self.suspected.iter().copied().chain(Mistake::UNNOTICED), &mut tried)?;
@@ -233,8 +228,8 @@ impl Search<'_> {
         Ok(Trial { mistake, psnr_db })
     }
 
-    /// Returns whether a correction is clearly better than the inputs as given, and its drawings fit by
-    /// themselves: one that merely turns black into some colour gains, too.
+    /// A correction must be clearly better than the inputs as given, and its drawings must fit by themselves: one that
+    /// merely turns black into some colour gains, too.
     fn explains(&self, trial: &Trial) -> bool {
         let is_likely =
             self.suspected.contains(&trial.mistake) || Mistake::UNNOTICED.contains(&trial.mistake);
@@ -242,8 +237,8 @@ impl Search<'_> {
         trial.psnr_db > (self.given_psnr_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
     }
 
-    /// Moves a similarity that is computed from other data than the trainer's, or swept, to where the drawings
-    /// match best (pattern search, Hooke and Jeeves 1961). Others are exact.
+    /// Refines a similarity that is swept or computed from other data than the trainer's (pattern search, Hooke and
+    /// Jeeves 1961). Others are exact.
     fn refined(&self, best: Trial) -> Result<Trial, CheckError> {
         if let Mistake::FocalScale(_) = best.mistake {
             return self.refined_focal(best);
@@ -279,7 +274,7 @@ impl Search<'_> {
 }
 
 impl Search<'_> {
-    /// Moves a factor of focal lengths, of which few are tried, to where the drawings match best.
+    /// Refines a factor of focal lengths, of which few are tried.
     fn refined_focal(&self, best: Trial) -> Result<Trial, CheckError> {
         let (mut found, mut step) = (best, FIRST_FOCAL_STEP);
         for _ in 0..=HALVINGS {
@@ -295,7 +290,7 @@ impl Search<'_> {
     }
 }
 
-/// Returns a similarity moved a step in a direction, about the centre of the scene.
+/// Moves a similarity a step in a direction, about the scene's centre.
 fn moved(similarity: Similarity, direction: usize, step: f64, centre: DVec3, diagonal: f64) -> Similarity {
     let step = if direction.is_multiple_of(2) { step } else { -step };
     let axis = |at: usize| DVec3::from_array(std::array::from_fn(|i| if i == at { 1.0 } else { 0.0 }));

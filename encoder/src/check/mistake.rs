@@ -79,10 +79,10 @@ const COLMAP_AXES: [i8; 3] = [2, 1, -3];
 const FOCAL_SCALES: [f64; 8] = [0.5, 2.0, 0.25, 4.0, 0.7, 1.4, 0.35, 2.8];
 
 impl Mistake {
-    /// Mistakes under which drawings still look like their photos.
+    /// Drawings still look like their photos under these.
     pub(super) const UNNOTICED: [Self; 2] = [Self::RotationsXyzw, Self::RotationsInverted];
 
-    /// Returns the mistakes that are tried where drawings and photos differ, beside frames.
+    /// Mistakes to try where drawings and photos differ, beside frames.
     pub(super) fn common() -> Vec<Self> {
         let cameras =
             [Self::OpenGlAxes, Self::WorldFromCamera, Self::WorldFromOpenGlCamera, Self::UpsideDown];
@@ -147,8 +147,7 @@ impl Mistake {
         corrected
     }
 
-    /// Returns the splat with the mistake corrected, with colours of degree 0; `None` if the mistake is not the
-    /// splat's.
+    /// The splat with the mistake corrected, with colours of degree 0; `None` for mistakes of other inputs.
     pub(crate) fn corrected_splat(self, scene: &Gaussians) -> Option<Gaussians> {
         let mut corrected = match self {
             Self::Mirrored(_) | Self::RotationsXyzw | Self::RotationsInverted | Self::Activated { .. } => {
@@ -306,7 +305,7 @@ fn from_axes(axes: [i8; 3]) -> Similarity {
     Similarity::from_rotation(DQuat::from_mat3(&matrix).normalize())
 }
 
-/// Returns the 23 rotations by right angles other than the identity, as the axes of [`from_axes`].
+/// The 23 rotations by right angles other than the identity, as axes of [`from_axes`].
 fn right_angles() -> Vec<[i8; 3]> {
     let mut all = Vec::new();
     for (order, parity) in
@@ -323,7 +322,6 @@ fn right_angles() -> Vec<[i8; 3]> {
     all
 }
 
-/// Writes the cause of a world with these axes.
 fn write_axes(axes: [i8; 3], f: &mut fmt::Formatter<'_>) -> fmt::Result {
     let name = |axis: i8| {
         let letter = ["x", "y", "z"][usize::from(axis.unsigned_abs().clamp(1, 3)) - 1];

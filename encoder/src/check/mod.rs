@@ -31,7 +31,7 @@ pub(crate) use report::ViewCheck;
 pub use suspicion::{Suspicion, suspicions};
 pub use view::{CheckView, psnr_db};
 
-/// PSNR against its mean colour from which a photo shows nothing, dB.
+/// A photo with this PSNR against its mean colour shows nothing, dB.
 const PLAIN_DB: f64 = 40.0;
 
 /// Draws the views of a scene and compares them with their photos.
@@ -67,7 +67,7 @@ where
     let is_suspect = options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some());
     let diagnosis = if means.psnr_db < FLAWLESS_DB || !means.fit() || is_suspect {
         let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;
-        // Where the drawings match as they are, only a mistake that improves them counts.
+        // Matching drawings: only a mistake that improves them counts.
         Some(found).filter(|found| !means.fit() || found.mistake.is_some())
     } else {
         None
@@ -146,7 +146,6 @@ fn means_of(checks: &[ViewCheck]) -> Means {
     }
 }
 
-/// Names the views that do not fit, if there are some.
 fn odd_views(checks: &[ViewCheck]) -> impl Iterator<Item = String> {
     let mut odd = checks.iter().filter(|view| !view.fits());
     let first = odd.next();

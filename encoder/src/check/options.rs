@@ -11,7 +11,6 @@ pub struct CheckOptions {
     pub width_px: u32,
     /// Folder for a picture of each view (photo left, drawing right); `None` writes no pictures.
     pub pictures_dir: Option<PathBuf>,
-    /// Width of the views in which mistakes are searched, pixels.
     pub diagnosis_width_px: u32,
     /// Number of views in which mistakes are searched, spread evenly over all views.
     pub diagnosis_views: usize,

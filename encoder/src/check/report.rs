@@ -46,7 +46,6 @@ pub struct CheckReport {
     pub diagnosis: Option<Diagnosis>,
 }
 
-/// Prints a table of the views and the diagnosis.
 impl fmt::Display for CheckReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(

@@ -9,31 +9,31 @@ use slag_math::stats::{Rank, quantile};
 
 use super::mistake::{FrameCandidate, FrameCause, Mistake};
 
-/// Share of the Gaussians that must look wrong: a splat may have a few of any kind.
+/// Least share of the Gaussians that must look wrong: a splat may have a few of any kind.
 const MOST: f64 = 0.999;
-/// Gaussians from which shares say something.
+/// Gaussians from which shares are meaningful.
 const MANY: usize = 1000;
-/// The opacity that 1 as a logit means.
+/// Opacity of the logit 1.
 const ACTIVATED_OPACITY: f32 = 0.7311;
 /// Opacity below which a Gaussian is not drawn at all.
 const INVISIBLE: f32 = 1.0 / 255.0;
-/// Relative difference between the middle of a photo and its principal point that no lens has.
+/// No lens has its principal point this far from the photo's middle (relative).
 const OFF_CENTRE: f64 = 0.15;
-/// Logarithm of the ratio of both focal lengths that no lens has.
+/// No lens has focal lengths with a larger ratio (logarithm).
 const UNEQUAL_FOCALS: f64 = 0.15;
 /// Fields of view that photos of a scene have, degrees.
 const USUAL_DEGREES: std::ops::RangeInclusive<f64> = 3.0..=150.0;
-/// Focal lengths below it are no pixels, if the principal point is none, either.
+/// Smaller focal lengths are not in pixels, if the principal point is not, either.
 const MOST_SHARES: f64 = 16.0;
 /// Gaussians below which a splat is hardly one.
 const FEW: usize = 10;
-/// The worlds of splat and cameras are apart if their middles are this many of their sizes from each other.
+/// Worlds of splat and cameras are apart if their middles are this many of their sizes from each other.
 const APART: f64 = 10.0;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Suspicion {
     pub text: String,
-    /// The mistake that would explain it; drawings tell.
+    /// The mistake that would explain it, for drawings to confirm.
     pub mistake: Option<Mistake>,
 }
 
@@ -58,7 +58,7 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
     found
 }
 
-/// Says that most photos have a pose that others have, too, as where poses were never found.
+/// Most photos share their pose with others, as where poses were never found.
 fn repeated(views: &[View]) -> Option<String> {
     let mut n_of_pose: BTreeMap<[u64; 12], usize> = BTreeMap::new();
     for view in views {
@@ -72,7 +72,7 @@ fn repeated(views: &[View]) -> Option<String> {
         .then(|| format!("{n} of {} photos have exactly the pose of another: {advice}", views.len()))
 }
 
-/// Says which Gaussians show nothing, or less than they should.
+/// Gaussians that show nothing, or less than they should.
 fn undrawable(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
     let mut found: Vec<String> = Vec::new();
     if usable.is_empty() {
@@ -97,13 +97,13 @@ fn undrawable(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
     found
 }
 
-/// Says which columns of the file may hold other quantities than expected.
+/// Columns of the file that may hold other quantities than expected.
 fn misread(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
     let mut found: Vec<String> = Vec::new();
     if usable.len() < MANY {
         return found;
     }
-    // Percents and bytes as logits saturate; surfaces may be opaque on purpose, of a logit that somebody chose.
+    // Percentages and bytes as logits saturate; surfaces may be opaque on purpose, with a chosen logit.
     let is_saturated = share(usable, |i| scene.opacities[i] >= 1.0) > 0.5;
     if is_saturated && share(usable, |i| scene.opacities[i] > ACTIVATED_OPACITY) > MOST {
         let what = "the file's opacities may be percents or bytes, not logits";
@@ -132,7 +132,7 @@ fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
     (usable.len() >= MANY && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
 }
 
-/// Says that Gaussians agree with another one in position, scales and opacity, beyond the first of a kind.
+/// Gaussians that agree with an earlier one in position, scales and opacity.
 fn doubled(scene: &Gaussians, usable: &[usize]) -> Option<String> {
     let key = |i: &usize| {
         let mut hasher = DefaultHasher::new();
@@ -152,7 +152,7 @@ fn doubled(scene: &Gaussians, usable: &[usize]) -> Option<String> {
     })
 }
 
-/// Says that coordinates that were stored in 32 bits are rounded by more than the size of small Gaussians.
+/// 32-bit coordinates are rounded by more than the size of small Gaussians.
 fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<String> {
     let means = || usable.iter().map(|i| scene.means_in_world[*i]);
     let is_f32 = |mean: DVec3| mean.to_array().iter().all(|x| f64::from(*x as f32) == *x);
@@ -165,7 +165,7 @@ fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<String> {
     let farthest = quantile(&mut farthest, 500, Rank::After)?;
     let (rounding, size) =
         (farthest * f64::from(f32::EPSILON), f64::from(quantile(&mut sizes, 100, Rank::After)?));
-    // Without an offset, the Gaussians are small and not the coordinates large.
+    // Without an offset, the Gaussians are small rather than the coordinates large.
     (rounding > size && size > 0.0 && farthest > scene_diagonal(scene)).then(|| {
         format!(
             "the splat's coordinates are so large that 32 bits round them to {rounding:.1e}, more than its small \
@@ -174,7 +174,7 @@ fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<String> {
     })
 }
 
-/// Returns the round offset between splat and cameras, where they are far apart.
+/// Returns the round offset between splat and cameras that are far apart.
 fn shifted(scene: &Gaussians, views: &[View]) -> Option<FrameCandidate> {
     let positions: Vec<DVec3> = views.iter().map(View::position_in_world).collect();
     let cameras = positions.iter().sum::<DVec3>() / positions.len().max(1) as f64;
@@ -183,14 +183,14 @@ fn shifted(scene: &Gaussians, views: &[View]) -> Option<FrameCandidate> {
     if views.is_empty() || offset.length() <= APART * size || size <= 0.0 {
         return None;
     }
-    // People subtract round numbers: the round one near enough is exact, if there is one.
+    // People subtract round numbers, so a round one near enough is exact.
     let unit = 10f64.powf(size.log10().ceil());
     let translation = (offset / unit).round() * unit;
     let splat_from_poses = Similarity { translation, ..Similarity::IDENTITY };
     translation.is_finite().then_some(FrameCandidate { cause: FrameCause::Shifted, splat_from_poses })
 }
 
-/// Returns what is wrong with the intrinsics of all photos in the same way.
+/// Returns mistakes that the intrinsics of all photos share.
 fn intrinsics(cameras: &[Intrinsics]) -> Vec<Suspicion> {
     let Some(first) = cameras.first() else { return Vec::new() };
     if let Some(mistake) = mistaken_centre(cameras, first) {
@@ -225,14 +225,14 @@ fn intrinsics(cameras: &[Intrinsics]) -> Vec<Suspicion> {
     texts.into_iter().map(|text| Suspicion { text, mistake: None }).collect()
 }
 
-/// Returns the wider of a pinhole camera's angles.
+/// The wider of a pinhole camera's angles.
 fn field_of_view_degrees(camera: &Intrinsics) -> f64 {
     let x = f64::from(camera.width_px) / camera.focal_x_px;
     let y = f64::from(camera.height_px) / camera.focal_y_px;
     (2.0 * (x.max(y) / 2.0).atan()).to_degrees()
 }
 
-/// Returns the principal point in halves of the image's sides.
+/// Principal point in halves of the image's sides.
 fn relative_centre(camera: &Intrinsics) -> [f64; 2] {
     let of = |centre_px: f64, side_px: u32| 2.0 * centre_px / f64::from(side_px);
     [of(camera.centre_x_px, camera.width_px), of(camera.centre_y_px, camera.height_px)]
@@ -242,7 +242,7 @@ fn is_off(centre: [f64; 2]) -> bool {
     centre.iter().any(|at| (at - 1.0).abs() > OFF_CENTRE)
 }
 
-/// Returns the mistake of principal points that are far from the middle of the photos in the same way.
+/// Mistake of principal points that are all far from the photos' middles in the same way.
 fn mistaken_centre(cameras: &[Intrinsics], first: &Intrinsics) -> Option<Mistake> {
     let is_share = |camera: &Intrinsics| {
         let is_within = |centre: f64| centre > 0.0 && centre <= 1.0;
@@ -281,7 +281,7 @@ fn mistaken_centre(cameras: &[Intrinsics], first: &Intrinsics) -> Option<Mistake
     ((factor - 1.0).abs() > OFF_CENTRE).then_some(Mistake::IntrinsicsOfSize(factor))
 }
 
-/// Returns the diagonal of the box around the middle 90 % of the means along each axis.
+/// Diagonal of the box around the middle 90 % of the means along each axis.
 pub(super) fn scene_diagonal(scene: &Gaussians) -> f64 {
     (at_per_mille(scene, 950) - at_per_mille(scene, 50)).length()
 }
@@ -295,7 +295,6 @@ pub(super) fn at_per_mille(scene: &Gaussians, per_mille: usize) -> DVec3 {
     DVec3::new(along(0), along(1), along(2))
 }
 
-/// Returns the largest distance of a position from the mean of all positions.
 pub(super) fn camera_spread(positions: &[DVec3]) -> f64 {
     let centre = positions.iter().sum::<DVec3>() / positions.len().max(1) as f64;
     positions.iter().map(|p| p.distance(centre)).fold(0.0, f64::max)

@@ -43,9 +43,8 @@ const TO: [[f64; 3]; 6] = [
     [8.8, -11.7, 8.1],
 ];
 
-/// Oracle: Umeyama's method by singular values in NumPy, float64, recorded. Jacobi's rotations stop at
-/// off-diagonals of 1e-9. The points are unrelated; those of the second case are mirrored, so the best orthogonal
-/// matrix of one of them is a reflection, which must not be taken.
+/// Oracle: Umeyama's method by singular values in NumPy, float64, recorded. Jacobi's rotations stop at off-diagonals
+/// of 1e-9. The points of the second case are mirrored: the best orthogonal matrix of one is a reflection, never taken.
 #[test]
 fn similarities_are_umeyamas() {
     let recorded = [
@@ -111,7 +110,7 @@ fn cameras_are_paired_by_name_and_must_determine_a_rotation() {
     let line = [[0.0; 3], [1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [-3.0, -6.0, -9.0]];
     assert_eq!(align(&views(&line), &from), Err(AlignError::Line));
     assert_eq!(align(&from, &views(&[[1.0; 3]; 6])), Err(AlignError::Line));
-    // Two views of one file name tell nothing of it.
+    // Two views with one file name are ambiguous.
     let twice: Vec<View> =
         to.iter().flat_map(|v| [v.clone(), View { name: format!("b/{}", v.name), ..v.clone() }]).collect();
     assert_eq!(align(&from, &twice), Err(AlignError::Few { n: 0 }));
@@ -239,7 +238,7 @@ fn intrinsics_of_no_camera_are_suspected() {
     );
 }
 
-/// Photos whose poses were never found have all the same one; a pair from a tripod is nothing.
+/// Photos whose poses were never found all have the same one; a tripod's pair does not count.
 #[test]
 fn poses_that_repeat_are_suspected() {
     let mut views = views(&FROM);

@@ -12,9 +12,9 @@ use crate::raster::{Drawing, LoadedScene, RasterView};
 pub struct CheckView {
     pub name: String,
     pub image: RgbImage,
-    /// Pixels that belong to the photo, row-major, as 255 and 0; `None` if all do.
+    /// Pixels of the photo are 255, others 0, row-major; `None` if all belong to it.
     pub valid: Option<GrayImage>,
-    /// Its camera, at the resolution of the photo.
+    /// At the photo's resolution.
     pub view: RasterView,
 }
 
@@ -48,7 +48,7 @@ impl CheckView {
     }
 }
 
-/// Returns the PSNR of a picture against a photo, dB; 100 where they are equal.
+/// PSNR of a picture against a photo, dB; 100 where they are equal.
 pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
     let squares = photo.pixels().enumerate().flat_map(|(pixel, photo)| {
         let value = &value;
@@ -61,7 +61,7 @@ pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
 }
 
 impl CheckView {
-    /// Returns the PSNR of a picture against the photo, dB, of the pixels that belong to it.
+    /// Over the pixels that belong to the photo, dB.
     pub(super) fn psnr_db(&self, value: impl Fn(usize, usize) -> f32) -> f64 {
         let Some(valid) = &self.valid else { return psnr_db(&self.image, value) };
         let of_photo = |pixel: usize, c: usize| f32::from(self.image.as_raw()[pixel * 3 + c]) / 255.0;
@@ -73,7 +73,6 @@ impl CheckView {
         all + 10.0 * share.log10()
     }
 
-    /// Returns the PSNR of the photo's mean colour, dB.
     pub(super) fn flat_psnr_db(&self) -> f64 {
         let is_valid = |pixel: usize| self.valid.as_ref().is_none_or(|valid| valid.as_raw()[pixel] > 0);
         let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| is_valid(*pixel));
@@ -83,7 +82,7 @@ impl CheckView {
     }
 }
 
-/// Returns a PNG with the photo on the left and the drawing on the right.
+/// A PNG with the photo on the left and the drawing on the right.
 pub(super) fn picture(view: &CheckView, drawing: &Drawing) -> Result<Vec<u8>, CheckError> {
     let (width_px, height_px) = view.image.dimensions();
     let mut picture = RgbImage::new(width_px * 2, height_px);
@@ -96,13 +95,13 @@ pub(super) fn picture(view: &CheckView, drawing: &Drawing) -> Result<Vec<u8>, Ch
     Ok(png.into_inner())
 }
 
-/// Returns the file name of a view's picture: unique by its index, safe for any view name.
+/// Unique by its index, safe for any view name.
 pub(super) fn picture_name(index: usize, view_name: &str) -> String {
     let safe = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
     format!("{index:04}_{}.png", view_name.chars().map(safe).take(120).collect::<String>())
 }
 
-/// Returns the mean, 0 of no values.
+/// Mean; 0 without values.
 pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, n) = values.fold((0.0, 0_usize), |(sum, n), v| (sum + v, n + 1));
     sum / n.max(1) as f64

@@ -64,17 +64,14 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     })
 }
 
-/// What is compared: the splat, and the photos' cameras in its world.
 struct Inputs {
     scene: Gaussians,
-    /// Views whose photos are there.
     views: Vec<View>,
-    /// The similarity that a file states, which the cameras were moved by.
+    /// The similarity that a file states; the cameras are moved by it already.
     stated: Option<Similarity>,
     frames: Vec<FrameCandidate>,
     suspicions: Vec<Suspicion>,
     notes: Vec<String>,
-    /// Whether frames or photos are left out.
     is_partial: bool,
 }
 
@@ -115,11 +112,11 @@ impl Inputs {
     }
 }
 
-/// Checks the inputs; returns the report, and whether something was left out or does not fit.
+/// Returns the report, and whether something was left out or does not fit.
 fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
     let Inputs { scene, views, stated, frames, suspicions, mut notes, is_partial } = inputs;
     let n = (args.samples as usize).min(views.len());
-    // One at a time: a photo is loaded when the check reaches it.
+    // Photos are loaded one at a time, when the check reaches them.
     let rotated = RotatedPhotos::default();
     let photos = (0..n).map(|i| load(&views[i * views.len() / n], &rotated));
     let options = CheckOptions {
@@ -135,7 +132,7 @@ fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
     if let (true, Some(first)) = (args.input.strict, report.unreadable.first()) {
         return Err(anyhow!("{first}"));
     }
-    // Cameras were in the stated frame already; what is reported and written begins at the poses.
+    // Cameras are in the stated frame already; reports and files begin at the poses.
     if let (Some(stated), Some(diagnosis)) = (stated, &mut report.diagnosis) {
         diagnosis.splat_from_poses = diagnosis.splat_from_poses.map(|found| found.after(&stated));
     }
@@ -171,7 +168,7 @@ fn load(view: &View, rotated: &RotatedPhotos) -> Result<CheckView, IngestError> 
     Ok(CheckView { view: RasterView::of(&view), name: view.name, image, valid })
 }
 
-/// Returns the similarities to try; all begin where `frame` leads, if there is one.
+/// Returns the similarities to try; all begin after `frame`, if given.
 fn candidates(
     args: &CheckArgs,
     views: &[View],
@@ -205,7 +202,7 @@ fn candidates(
     Ok(found)
 }
 
-/// Writes the similarity that was found, and returns what was done.
+/// Writes the found similarity, and returns a line about it.
 fn write_frame(path: &Path, report: &CheckReport) -> Result<String> {
     let similarity = report.diagnosis.as_ref().and_then(|diagnosis| diagnosis.splat_from_poses);
     Ok(match (similarity, &report.diagnosis) {

@@ -75,7 +75,6 @@ fn set<T: Clone>(to: &mut T, value: &Option<T>) {
 }
 
 impl ChoiceArgs {
-    /// Makes the choices in settings that have the defaults.
     pub(super) fn apply(&self, settings: &mut EncodeSettings) {
         self.preset.apply(settings);
         let EncodeSettings { view, aggregation, cells, run, .. } = settings;
@@ -106,7 +105,6 @@ fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
     }
 }
 
-/// Parses a number of views, or a share of them in per cent.
 fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
     let limit = match text.strip_suffix('%') {
         Some(percent) => {

@@ -65,8 +65,7 @@ pub struct OutputArgs {
 }
 
 impl OutputArgs {
-    /// Logs to stderr from now on: warnings and above with `--quiet`, else information as well; RUST_LOG overrides
-    /// both.
+    /// Logs to stderr from now on: with `--quiet` warnings and above, else information, too. RUST_LOG overrides both.
     ///
     /// # Panics
     /// If the process logs already.
@@ -78,7 +77,7 @@ impl OutputArgs {
             .with_ansi(std::io::stderr().is_terminal())
             .with_target(false)
             .without_time()
-            // It would panic where nobody reads stderr any more.
+            // Reporting its own errors panics when stderr is closed.
             .log_internal_errors(false)
             .init();
     }
@@ -151,7 +150,6 @@ pub fn parse_frame(text: &str) -> Result<FrameChoice, String> {
     })
 }
 
-/// Reads a time of any seconds above 0.
 pub(crate) fn parse_secs(text: &str) -> Result<Duration, String> {
     let secs = text.parse().ok().filter(|secs: &f64| *secs > 0.0);
     secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok())
@@ -177,7 +175,7 @@ pub(super) fn to_stdout(text: &str) -> Result<()> {
     })
 }
 
-/// Returns a flag that a signal to stop sets; a second one ends the program at once.
+/// Returns a flag that a stop signal sets; a second signal ends the program at once.
 pub fn cancel_flag() -> Result<Arc<AtomicBool>> {
     let flag = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&flag);
@@ -191,9 +189,8 @@ pub fn cancel_flag() -> Result<Arc<AtomicBool>> {
     Ok(flag)
 }
 
-/// Returns the time to sign, seconds since 1970: SOURCE_DATE_EPOCH if it is set, else the present.
+/// Time to sign, seconds since 1970: SOURCE_DATE_EPOCH if set, else now.
 pub fn now_unix_secs() -> Result<u64> {
-    // The convention of reproducible-builds.org.
     std::env::var_os("SOURCE_DATE_EPOCH").map_or_else(|| Ok(clock_unix_secs()), |text| parse_epoch(&text))
 }
 
@@ -202,7 +199,7 @@ fn parse_epoch(text: &OsStr) -> Result<u64> {
     secs.with_context(|| format!("SOURCE_DATE_EPOCH is {text:?}, expected seconds since 1970; unset it"))
 }
 
-/// Warns of metadata of a store that expires soon: robots then refuse the store.
+/// Warns of store metadata that expires soon: robots then refuse the store.
 pub(super) fn warn_of_expiry(store: &Path) {
     match MetadataReader::new(store).expiry_warnings(clock_unix_secs()) {
         Ok(warnings) => warnings.iter().for_each(|warning| tracing::warn!("{warning}")),
@@ -210,15 +207,14 @@ pub(super) fn warn_of_expiry(store: &Path) {
     }
 }
 
-/// Opens the models that the flags name, and returns how they are run.
 pub fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
     let models = commands::open(args.models.as_deref(), &|name| std::env::var_os(name))?;
     Ok((models, session_options(&args.how)?))
 }
 
-/// Returns the models of the flags as a later run in another folder finds them.
+/// Makes `--models` valid for a later run in another folder.
 pub(crate) fn lasting_name(models: &Path) -> PathBuf {
-    // A name of a pulled model is no path.
+    // The name of a pulled model is no path.
     if models.is_dir() {
         std::path::absolute(models).unwrap_or_else(|_| models.into())
     } else {
@@ -226,12 +222,12 @@ pub(crate) fn lasting_name(models: &Path) -> PathBuf {
     }
 }
 
-/// Returns how models run: with one thread each, because views are encoded in parallel.
+/// One thread per model, because views are encoded in parallel.
 pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     how.session_options(&commands::runtime_folders(&std::env::current_exe().unwrap_or_default()), 1)
 }
 
-/// Opens the text encoder that a store was encoded with: that of --models, else the one that the store remembers.
+/// Opens a store's text encoder: that of --models, else the one that the store remembers.
 pub fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
     let expected = &reader.manifest().encoder;
     let remembered = reader.models()?.and_then(|record| record.models);
@@ -255,7 +251,7 @@ pub(crate) fn available_threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Completes when the user or the system asks the program to stop.
+/// Completes on a stop signal from the user or the system.
 pub async fn stopped() {
     match stop_signal() {
         Ok(stop) => stop.await,
@@ -270,7 +266,7 @@ pub fn runtime() -> Result<tokio::runtime::Runtime> {
         .context("cannot start the service's threads")
 }
 
-/// Returns the parser of profiles, whose names the help text lists.
+/// Parser of profiles; the help lists their names.
 pub(crate) fn profile_parser() -> impl TypedValueParser<Value = Profile> {
     PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
 }

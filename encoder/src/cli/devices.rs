@@ -23,11 +23,9 @@ pub(super) fn run(json: bool) -> Result<Exit> {
     Ok(Exit::Done)
 }
 
-/// Returns the variable that disables Mesa's layer that selects devices (`VkLayer_MESA_device_select.json`), if the
-/// layer would print an error of its own.
-///
-/// The layer asks the Wayland compositor for its device, and libwayland prints "error: XDG_RUNTIME_DIR is invalid"
-/// where there is no session, as on servers. The layer only orders devices.
+/// Returns the variable that disables Mesa's device selection (`VkLayer_MESA_device_select.json`), if it would print an
+/// error of its own: it asks the Wayland compositor, and libwayland prints "error: XDG_RUNTIME_DIR is invalid" where
+/// there is no session, as on servers. The layer only orders devices.
 pub fn no_device_selection() -> Option<(&'static str, &'static str)> {
     let is_noisy = cfg!(target_os = "linux") && std::env::var_os("XDG_RUNTIME_DIR").is_none();
     is_noisy.then_some(("NODEVICE_SELECT", "1"))

@@ -67,7 +67,7 @@ pub(super) fn run(args: &DiffArgs, json: bool) -> Result<Exit> {
     Ok(Exit::Done)
 }
 
-/// Returns a generation of a store, the current one if `number` is absent.
+/// `None` is the current generation.
 fn generation(reader: &StoreReader, number: Option<u64>) -> Result<Generation<'_>> {
     let is_meant =
         |published: &&Published| number.is_none_or(|number| published.manifest.generation == number);

@@ -121,7 +121,7 @@ pub(super) fn draw(args: &DrawArgs, progress: &dyn Progress, json: bool) -> Resu
     Ok(Exit::Done)
 }
 
-/// Returns a view as it is drawn: the name's ending says the format.
+/// The file format follows from the name's extension.
 fn drawn_view(view: &View) -> DrawnView {
     let intrinsics = view.intrinsics.without_distortion();
     let name = Path::new(&view.name).with_extension("png").to_string_lossy().into_owned();

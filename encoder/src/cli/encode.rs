@@ -168,7 +168,7 @@ pub struct EncodeArgs {
     restart: bool,
 }
 
-/// Names stand in logs and headers.
+/// Refuses names that cannot stand in logs and headers.
 fn parse_name(text: &str) -> Result<String, String> {
     match (1..=200).contains(&text.len()) && !text.contains(char::is_control) {
         true => Ok(text.to_owned()),
@@ -176,7 +176,7 @@ fn parse_name(text: &str) -> Result<String, String> {
     }
 }
 
-/// What trainers call splats and their folders, whatever they show.
+/// Names that trainers give to any splat or folder.
 const NAMES_OF_TRAINERS: [&str; 14] = [
     "data",
     "export",
@@ -194,7 +194,7 @@ const NAMES_OF_TRAINERS: [&str; 14] = [
     "tmp",
 ];
 
-/// Returns the name of a splat: of its file, or of the next folder above with a name of its own.
+/// Name of a splat: of its file, or of the nearest folder above with a name of its own.
 fn name_of(splat: &Path) -> Option<String> {
     let path = std::path::absolute(splat).ok()?;
     let name = |part: &OsStr| Some(part.to_str()?.split('.').next()?.to_owned());
@@ -206,7 +206,7 @@ fn name_of(splat: &Path) -> Option<String> {
     names.filter(|name| parse_name(name).is_ok()).find(is_own)
 }
 
-/// Returns the settings of the flags, with choices that may be others than those of the flags.
+/// Settings of the flags, with the choices of `choices` instead of the flags' own.
 fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     let input = &args.input;
     // A geo-reference beside the scene belongs to it.
@@ -264,7 +264,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     cells.occupancy = args.occupancy.map(|voxel_m| OccupancySettings { voxel_m });
     cells.photo_poses = args.photo_poses;
     cells.landmarks = args.locate;
-    // Robots keep to the scene that they know by its name.
+    // Robots recognise a scene by its name.
     let published_name = || store::scene_name(&args.store);
     let of_splat = || name_of(&input.scene);
     let of_store = || args.store.file_name().map(|name| name.to_string_lossy().into_owned());
@@ -276,7 +276,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     Ok(settings)
 }
 
-/// Returns where masks come from, if not from the embedded model.
+/// Where masks come from, if not from the embedded model.
 fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
     let ignore_ids = || args.ignore_mask_ids.clone();
     let (own, other) = (!["auto", "graph"].contains(&args.masks.as_str()), args.sam.segmenter.is_some());
@@ -298,7 +298,7 @@ fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
     }
 }
 
-/// Returns the settings of the flags, with the choices that a target picks, and what it expects.
+/// Settings of the flags, with a target's choices, and what is expected of them.
 fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expectation>)> {
     let settings = settings(args, &args.choices)?;
     match args.target.choose(&settings.inputs)? {
@@ -352,8 +352,7 @@ pub(crate) struct TargetArgs {
 }
 
 impl TargetArgs {
-    /// Returns the choices that meet the target on the inputs, and what is expected of them; `None` without a
-    /// target.
+    /// Returns the choices that meet the target on the inputs, and what is expected of them; `None` without a target.
     pub(super) fn choose(&self, inputs: &InputSettings) -> Result<Option<(ChoiceArgs, Expectation)>> {
         let seconds = self.target_seconds.map(|seconds| seconds.as_secs_f64());
         let target = Target { seconds, bytes: self.target_bytes.map(|bytes| bytes.0) };
@@ -440,7 +439,7 @@ pub(crate) struct SamArgs {
 }
 
 impl SamArgs {
-    /// Returns Segment Anything as the source of masks, if --segmenter names it.
+    /// Segment Anything as the source of masks, if --segmenter names it.
     pub(super) fn masks(&self, preset: &SamSettings) -> Result<Option<Masks>> {
         let Some(segmenter) = &self.segmenter else { return Ok(None) };
         let dir = commands::resolve(segmenter, &|name| std::env::var_os(name))?;
@@ -500,8 +499,7 @@ mod tests {
         }
     }
 
-    /// A scene that was named once keeps its name, also where its manifest is damaged since; a new one has that of its
-    /// splat.
+    /// A store keeps its scene's name even if its manifest is damaged; a new one takes the splat's.
     #[test]
     fn a_scene_keeps_its_name() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -524,7 +522,7 @@ mod tests {
         assert_eq!(name(&[]), "yard");
     }
 
-    /// A flag that would have no effect is refused, and what it is for is said.
+    /// Flags without effect are refused, with what they are for.
     #[test]
     fn no_flag_is_given_in_vain() {
         let refused = |flags: &str| {
@@ -550,7 +548,7 @@ mod tests {
         }
     }
 
-    /// What trainers write, and where.
+    /// Splat paths as trainers write them.
     #[test]
     fn a_scene_is_called_what_its_splat_is() {
         for (path, name) in [

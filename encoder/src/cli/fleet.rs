@@ -75,7 +75,6 @@ pub(crate) struct CoordinatorArgs {
 }
 
 impl CoordinatorArgs {
-    /// Encodes by the fleet that the flags name, or on this machine.
     pub(super) fn encode(
         &self,
         settings: &EncodeSettings,
@@ -171,15 +170,14 @@ pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
     Ok(if cancel.load(Ordering::Relaxed) { Exit::Interrupted } else { Exit::Done })
 }
 
-/// Opens a bucket with the credentials of the environment.
+/// Takes credentials from the environment.
 pub(super) fn open_bucket(url: &str) -> Result<Arc<Bucket>> {
-    // Variables that are no text name nothing here.
+    // Variables that are not UTF-8 are none of ours.
     let variables =
         std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.into_string().ok()?)));
     Ok(Arc::new(Bucket::open(url, variables)?))
 }
 
-/// Reads the times of a fleet.
 fn parse_period(text: &str) -> Result<Duration, String> {
     let period = parse_secs(text).ok().filter(|period| period.as_millis() >= 100);
     period.ok_or_else(|| "expected seconds, at least 0.1".into())

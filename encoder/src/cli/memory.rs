@@ -6,7 +6,7 @@ use slag_common::ByteSize;
 use slag_common::byte_size::ByteSizeError;
 
 const MIN_MEMORY_BYTES: u64 = 64 << 20;
-/// Working memory on machines that do not report free memory.
+/// For machines that do not report free memory.
 const UNKNOWN_MEMORY_BYTES: u64 = 2 << 30;
 
 pub(crate) fn parse_memory(text: &str) -> Result<u64, String> {
@@ -21,15 +21,14 @@ pub(crate) fn default_memory_bytes() -> u64 {
     half_of(free_memory_bytes())
 }
 
-/// Returns the free memory, within the limit of the control group (version 2) if there is one; `None` on machines
-/// that do not report it.
+/// Free memory, within the control group's limit (version 2) if any; `None` on machines that do not report it.
 pub fn free_memory_bytes() -> Option<u64> {
     let read = |path: &str| fs::read_to_string(path).ok();
     let group = |file: &str| read(&format!("/sys/fs/cgroup/memory.{file}"))?.trim().parse::<u64>().ok();
     free(read("/proc/meminfo").as_deref(), group("max"), group("current"))
 }
 
-/// `meminfo`: the content of `/proc/meminfo`. `max_bytes`, `current_bytes`: the control group's limit and use.
+/// `meminfo`: content of `/proc/meminfo`; the others: the control group's limit and use.
 fn free(meminfo: Option<&str>, max_bytes: Option<u64>, current_bytes: Option<u64>) -> Option<u64> {
     let available = |text: &str| {
         let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;

@@ -188,7 +188,7 @@ pub fn exit_of(result: Result<Exit>, json: bool) -> Exit {
 mod tests {
     use super::*;
 
-    /// A bucket or database that hangs up breaks a pipe, too.
+    /// A bucket or database that hangs up breaks a pipe, too, and that is a failure.
     #[test]
     fn only_the_reader_of_stdout_may_leave() {
         let of_network = io::Error::from(io::ErrorKind::BrokenPipe);

@@ -20,7 +20,7 @@ use crate::store::metadata::MetadataReader;
 const STRAY_SHARE: f64 = 0.02;
 const PORT: u16 = 7733;
 
-/// Returns the lines of a published store: extent, `query` and `serve` here, `trust` and `fetch` on the robot.
+/// Lines for a published store: extent, `query` and `serve` here, `trust` and `fetch` on the robot.
 pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
     let here = shell_word(store);
     // The page knows no --activated.
@@ -32,7 +32,7 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
     Ok(lines + &of_robot(store, &format!("http://0.0.0.0:{PORT}"))?)
 }
 
-/// Returns the lines for a robot, and the extent of what it can fetch. `url`: where the store is served.
+/// Lines for a robot, with the extent it can fetch. `url`: where the store is served.
 pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
     let reader = StoreReader::open(store)?;
     let manifest = reader.manifest();
@@ -60,7 +60,7 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
     Ok(lines)
 }
 
-/// Returns a word to ask for: drones survey yards and streets.
+/// A word to ask for: drones survey yards and streets.
 fn example(reader: &StoreReader) -> &'static str {
     if reader.manifest().geo_reference.is_some() { "car" } else { "chair" }
 }
@@ -76,7 +76,6 @@ pub(super) fn of_check(input: &InputArgs) -> String {
     format!("\nnext\n  slag-encoder encode{}{every}{activated} --store STORE\n", of_input(input))
 }
 
-/// Returns the flags of splat, poses, photos and their frame.
 fn of_input(input: &InputArgs) -> String {
     let frame = match &input.splat_frame {
         FrameChoice::Auto => None,
@@ -93,19 +92,19 @@ fn of_input(input: &InputArgs) -> String {
     paths.into_iter().filter_map(flag).collect()
 }
 
-/// Returns the box around the means of a cell, which large Gaussians do not reach beyond, by the head of one of its
-/// shards; `None` where that cannot be read.
+/// Box around a cell's means, which ignores the size of large Gaussians, from the head of one of its shards; `None`
+/// where that cannot be read.
 fn mean_box(reader: &StoreReader, cell: &CellRecord) -> Option<Aabb> {
     let shard = cell.shards.values().next()?;
     let head = files::read_short(&reader.object_path(shard.hash), HEADER_END_BYTES).ok()?;
     Some(ShardHeader::of_start(&head)?.position_box())
 }
 
-/// Returns the extent without strays, and the centre of the cell in the middle of the Gaussians. `boxes`: of each
-/// cell, with the number of its Gaussians.
+/// Extent without strays, and the centre of the cell in the middle of the Gaussians. `boxes`: each cell's, with its
+/// number of Gaussians.
 fn extent_and_place(boxes: &[(Aabb, f64)]) -> (Aabb, DVec3) {
     let total: f64 = boxes.iter().map(|(_, n)| n).sum();
-    // The coordinate below which a share of the Gaussians lies, each at its cell's side.
+    // Coordinate below which a share of the Gaussians lies, each counted at its cell's side.
     let quantile = |axis: usize, share: f64, side: fn(&Aabb) -> DVec3| {
         let mut sides: Vec<(f64, f64)> = boxes.iter().map(|(of, n)| (side(of)[axis], *n)).collect();
         sides.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -130,14 +129,13 @@ fn point(at: DVec3) -> String {
     format!("({:.1}, {:.1}, {:.1})", at.x, at.y, at.z)
 }
 
-/// Returns the name of this machine, which robots of the same network may know it by.
+/// This machine's name, by which robots on the same network may reach it.
 fn host_name() -> String {
     let name = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let name = name.trim();
     if name.is_empty() { "BASE".into() } else { name.into() }
 }
 
-/// Quotes a path for a shell where it needs it.
 fn shell_word(path: &Path) -> String {
     let text = path.display().to_string();
     let is_plain = |c: char| c.is_alphanumeric() || "/._-+,:@%=".contains(c);
@@ -163,7 +161,7 @@ mod tests {
         assert_eq!(at, DVec3::new(1.0, 1.5, 0.5));
     }
 
-    /// What was given is said again: the next command needs it, too.
+    /// The next command gets the same inputs.
     #[test]
     fn lines_repeat_the_inputs() {
         let line = "slag-encoder check --scene a.ply --views b --images c --splat-frame none --every 3 --activated scales";

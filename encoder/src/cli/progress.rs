@@ -11,12 +11,10 @@ use crate::progress::{Progress, Silent};
 
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Returns a receiver that shows progress on stderr, or one that discards it.
 pub fn shown(is_shown: bool) -> Box<dyn Progress> {
     if is_shown { Box::new(TerminalProgress::new()) } else { Box::new(Silent) }
 }
 
-/// Shows progress to a person or writes it to a log.
 pub(crate) struct TerminalProgress {
     terminal: bool,
     stage: Mutex<Stage>,
@@ -34,7 +32,6 @@ struct Stage {
 }
 
 impl TerminalProgress {
-    /// Returns a receiver that draws bars if stderr is a terminal, else writes lines.
     fn new() -> Self {
         Self { terminal: std::io::stderr().is_terminal(), stage: Mutex::default() }
     }

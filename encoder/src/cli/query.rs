@@ -121,14 +121,13 @@ fn of_hit(hit: &Hit) -> String {
     format!("{:.3}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z)
 }
 
-/// Reads a splat and checks that it is the store's.
 fn read_scene(path: &Path, reader: &StoreReader, hits: &[Hit]) -> Result<Gaussians> {
     let scene = splat::read(path, &ReadOptions { with_sh_rest: true })?;
     query::check_scene(reader, &scene, hits).with_context(|| path.display().to_string())?;
     Ok(scene)
 }
 
-/// Writes the Gaussians that match, from the splat if there is one. `located`: those whose position a shard knows.
+/// Writes the matching Gaussians, from the splat if given. `located`: hits whose position a shard knows.
 fn write_ply(
     path: &Path,
     scene: Option<&Gaussians>,

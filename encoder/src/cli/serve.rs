@@ -16,7 +16,6 @@ use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
 use crate::view::{self, Viewed, Viewer};
 
-/// Time between two looks whether metadata expires soon.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(86_400);
 
 const EXAMPLES: &str = "Examples:\n\
@@ -65,7 +64,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
     let page = view::router(Viewer::new(shown));
     let router = serve::router(&args.store, limits, access, page)?;
     runtime()?.block_on(async {
-        // On stdout: with port 0 this is where a script learns the port.
+        // On stdout, so that a script learns the port where it was 0.
         let listening = |url: String| {
             let _ = writeln!(io::stdout(), "listening on {url}");
             if tracing::enabled!(tracing::Level::INFO)

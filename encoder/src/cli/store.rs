@@ -205,7 +205,7 @@ impl fmt::Display for Lines<'_> {
             }
         }
         write!(f, "{n_files} files, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
-        // What helps against faults of metadata stands beside them.
+        // Faults of metadata carry their own remedy.
         let has_objects = bad.iter().any(|file| file.hash.is_some());
         writeln!(
             f,

@@ -6,10 +6,10 @@ use crate::encode::coverage::CoverageReport;
 use crate::encode::front::Expectation;
 use crate::encode::{EncodeSettings, EncodeSummary, GpuReport, StageReport};
 
-/// A line: what it is about, and the figures.
+/// Label and figures.
 type Line = (&'static str, String);
 
-/// Returns the lines. `expected`: what a front expected of the target that was asked for.
+/// `expected`: what a front expects of the requested target.
 pub(super) fn lines(
     settings: &EncodeSettings,
     summary: &EncodeSummary,

@@ -73,7 +73,7 @@ pub(super) fn open_text(models: ModelArgs) -> OpenText {
 
 pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
     let viewer = Viewer::new(shown(args)?);
-    // A store that is not there, or of another splat, is told here, not to the page alone.
+    // Fails here, not only in the page, if the store is missing or of another splat.
     viewer.check()?;
     check_page()?;
     let access = Access::new(&args.listen, AccessSettings::default())?;
@@ -119,7 +119,7 @@ fn shown(args: &ViewArgs) -> Result<Viewed> {
     Ok(Viewed { store: args.store.clone(), splat, views, up, open_text })
 }
 
-/// Opens a link; where that fails, the link stands on the terminal already.
+/// Opens a link; on failure the link is already on the terminal.
 fn open_browser(link: &str) {
     let (program, arguments): (&str, &[&str]) = match std::env::consts::OS {
         "macos" => ("open", &[]),

@@ -11,23 +11,22 @@ use slag_math::matrix::{Panels, Rows};
 use slag_math::random::mix64;
 use slag_math::{dot, dot_f64};
 
-/// Share of an isotropic covariance in that of the texts: it keeps directions in which no text of the bank points.
+/// Share of the texts' covariance that is isotropic: it keeps directions in which no text of the bank points.
 const ISOTROPIC_SHARE: f64 = 0.2;
 pub(crate) const MAX_COMPONENTS: usize = 128;
 
 /// Most texts of a bank, and fewest that show the directions of queries.
 const MAX_TEXTS: usize = 2048;
 const MIN_TEXTS: usize = 8;
-/// Every so many-th text of a large bank is held out.
+/// One in this many texts of a large bank is held out.
 const HELD_OUT_STEP: usize = 4;
-/// Fewest texts of a large bank: a quarter of them bounds 95 of 100 texts, for which 19 are needed.
+/// Fewest texts of a large bank: its held-out quarter bounds 95 of 100 texts, which needs 19.
 const LARGE_BANK: usize = 19 * HELD_OUT_STEP;
 
 /// Texts like the expected queries: `[n][dim]`, unit vectors in the space of the embeddings.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TextBank {
     pub dim: usize,
-    /// `[n][dim]`.
     pub vectors: Vec<f32>,
 }
 
@@ -62,8 +61,7 @@ impl TextBank {
         self.vectors.len() / self.dim
     }
 
-    /// Returns whether a text is held out: the codebook is not made for it, so errors of its scores are like those
-    /// of texts that nobody has seen.
+    /// The codebook is not made for held-out texts, so errors of their scores are like those of unseen texts.
     pub fn is_held_out(&self, text: usize) -> bool {
         self.n_texts() >= LARGE_BANK && text % HELD_OUT_STEP == HELD_OUT_STEP - 1
     }
@@ -77,7 +75,7 @@ pub struct ScoreMetric {
 }
 
 impl ScoreMetric {
-    /// Returns the metric of a bank, without the texts that are held out.
+    /// Uses the texts that are not held out.
     pub fn new(dim: usize, bank: &TextBank) -> Self {
         let texts: Vec<usize> = (0..bank.n_texts()).filter(|text| !bank.is_held_out(*text)).collect();
         let columns = Panels::new(texts.len(), dim, |text, c| bank.vectors[texts[text] * dim + c]);
@@ -99,7 +97,7 @@ impl ScoreMetric {
         self.dim
     }
 
-    /// Returns the standard deviation of scores over some vectors, as root mean square over texts.
+    /// Standard deviation of scores over some vectors, as root mean square over texts.
     pub fn spread(&self, vectors: Rows<'_>) -> f32 {
         let (_, covariance) = moments_of(vectors);
         self.whitened(&covariance).iter().step_by(self.dim + 1).map(|v| f64::from(*v)).sum::<f64>().sqrt()
@@ -167,7 +165,7 @@ impl Basis {
         Self { mean, n_components, forms, basis }
     }
 
-    /// Returns the components of some embeddings, `[n][m]`.
+    /// `[n][m]`.
     pub fn components(&self, vectors: Rows<'_>) -> Vec<f32> {
         let (m, dim) = (self.n_components, self.mean.len());
         let offsets: Vec<f32> = (0..m)
@@ -183,7 +181,7 @@ impl Basis {
         out
     }
 
-    /// Rotates the coordinates: new component c is `rotation[c] . old components` (rows `[m][m]`, orthonormal).
+    /// New component c is `rotation[c] . old components` (rows `[m][m]`, orthonormal).
     pub fn rotate(&mut self, rotation: &[f32]) {
         let (m, dim) = (self.n_components, self.mean.len());
         for vectors in [&mut self.forms, &mut self.basis] {

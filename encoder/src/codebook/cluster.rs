@@ -7,16 +7,15 @@ use slag_math::matrix::{Panels, Rows};
 
 /// Rounds of 2-means when a cluster is split; the halves hardly move after the third.
 const SPLIT_ROUNDS: usize = 3;
-/// Rounds of k-means over all centroids at the end.
 const REFINE_ROUNDS: usize = 1;
-/// Up to so many clusters are all split: each is still far too large.
+/// Up to this many clusters are all split: each is still far too large.
 const FEW_CLUSTERS: usize = 16;
-/// One in so many clusters is split at a time, the worst first: the order is almost that of splitting one by one,
-/// and threads have work.
+/// One in this many clusters is split at a time, the worst first: almost the order of splitting one by one, with work
+/// for threads.
 const SPLIT_SHARE: usize = 8;
 
 pub struct Clusters {
-    /// `[n]`: cluster of each point.
+    /// `[n]`.
     pub codes: Vec<u32>,
     /// `[K][width]`: mean of each cluster's points.
     pub centres: Vec<f32>,
@@ -24,9 +23,8 @@ pub struct Clusters {
 
 /// Points in the order of their centroids.
 pub(super) struct Members {
-    /// By place in that order: the point.
     pub(super) order: Vec<u32>,
-    /// `[K + 1]`: first place of each centroid.
+    /// `[K + 1]`: start of each centroid in `order`.
     pub(super) starts: Vec<u32>,
 }
 
@@ -72,8 +70,8 @@ impl Clusters {
     }
 }
 
-/// Finds clusters whose points are, as root mean square over all, within `max_rms` of their centres, but
-/// no more than `max_clusters`. The result depends on the points alone, not on threads.
+/// Finds at most `max_clusters` clusters whose points have an RMS distance of at most `max_rms` from their centres.
+/// The result depends on the points alone, not on threads.
 pub fn clusters(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Clusters {
     let split = split(points, max_rms, max_clusters.max(1));
     let mut codes = vec![0; points.len()];
@@ -96,7 +94,7 @@ pub fn nearest(points: Rows<'_>, centres: &[f32]) -> Vec<u32> {
     Panels::new(width, half_norms.len(), |i, c| centres[c * width + i]).largest(points, &half_norms)
 }
 
-/// Returns the means of the clusters that have points, and renumbers these.
+/// Returns the means of the clusters with points, and renumbers these.
 fn recentre(points: Rows<'_>, codes: &mut [u32], n_clusters: usize) -> Vec<f32> {
     let mut members = vec![Vec::new(); n_clusters];
     codes.iter().enumerate().for_each(|(point, code)| members[*code as usize].push(point as u32));
@@ -132,7 +130,7 @@ impl Cluster {
     }
 }
 
-/// Splits the clusters with the largest squared errors until the sum keeps the budget.
+/// Splits the clusters with the largest squared errors until their sum is within the budget.
 fn split(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Vec<Cluster> {
     let n = points.len();
     let budget = f64::from(max_rms).powi(2) * n as f64;
@@ -162,8 +160,8 @@ fn split(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Vec<Cluster> {
     done
 }
 
-/// Splits a cluster by 2-means, starting from the member farthest from the centre and the member farthest from
-/// that. Returns the cluster itself if all members coincide.
+/// Splits a cluster by 2-means, from the member farthest from the centre and the one farthest from that. Returns the
+/// cluster itself if all members coincide.
 fn split_in_two(points: Rows<'_>, cluster: Cluster) -> Result<[Cluster; 2], Cluster> {
     let farthest = |from: &[f32]| {
         let distance = |point: &u32| (squared_distance(points.get(*point as usize), from), *point);

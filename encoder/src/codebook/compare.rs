@@ -10,7 +10,6 @@ use super::measure;
 
 const CHUNK: usize = 1024;
 
-/// Decodes components to vectors, as readers do.
 #[derive(Clone, Copy)]
 pub(super) struct Decoder<'a> {
     pub(super) dim: usize,
@@ -21,7 +20,7 @@ pub(super) struct Decoder<'a> {
 }
 
 impl Decoder<'_> {
-    /// Returns `[n][dim]` of components `[n][m]`.
+    /// `[n][m]` to `[n][dim]`.
     pub(super) fn decode(&self, components: &[f32]) -> Vec<f32> {
         let mut out = self.panels().product(Rows::all(components, self.m));
         for vector in out.chunks_exact_mut(self.dim) {
@@ -42,7 +41,6 @@ impl Decoder<'_> {
     }
 }
 
-/// The embeddings, and their centroids as readers decode them.
 pub(super) struct Reference<'a> {
     pub(super) embeddings: Rows<'a>,
     pub(super) members: &'a Members,
@@ -52,8 +50,8 @@ pub(super) struct Reference<'a> {
 }
 
 impl Reference<'_> {
-    /// Returns for each centroid the largest distance of a member from its decoded form, and the errors of the
-    /// decoded scores. `residuals`: components, in the order of the members, to add to the centroids.
+    /// Returns each centroid's largest distance of a member from its decoded form, and the errors of decoded scores.
+    /// `residuals`: components to add to the centroids, in the order of the members.
     pub(super) fn compare(&self, residuals: Option<(&Decoder<'_>, &[f32])>) -> (Vec<f32>, ScoreErrors) {
         let Self {
             embeddings,
@@ -87,7 +85,7 @@ impl Reference<'_> {
                     for ((d, r), e) in decoded.iter_mut().zip(of_centroid).zip(embedding) {
                         *d = e - (r + *d);
                     }
-                    // Bound of the products' rounding: the sizes of their terms times the number of additions.
+                    // Bound of rounding: sizes of the products' terms times the number of additions.
                     let rounding = added.as_ref().map_or(0.0, |(_, lengths, m, components)| {
                         let terms =
                             components[place * m..][..*m].iter().zip(lengths).map(|(c, l)| c.abs() * l);

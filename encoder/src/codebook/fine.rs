@@ -12,8 +12,8 @@ pub struct FineResiduals {
     pub errors: ScoreErrors,
 }
 
-/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits. Returns them and their decoded form,
-/// in readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
+/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits; returns them and their decoded form in
+/// readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
 pub(super) fn round(
     residuals: &[f32],
     m: usize,
@@ -31,7 +31,7 @@ pub(super) fn round(
         }
     }
     let n = (residuals.len() / m).max(1) as f64;
-    // At least 1e-9: a component without residuals must not cause a division by zero.
+    // At least 1e-9, against division by zero where a component has no residuals.
     let sizes: Vec<f32> = squares.iter().map(|s| ((s / n).sqrt() as f32).max(1e-9)).collect();
     let steps: Vec<f32> = sizes.iter().zip(ranges).map(|(size, range)| size / range).collect();
     let (mut scales, mut values) =

@@ -6,9 +6,9 @@ use slag_common::shard::ScoreErrors;
 use super::basis::TextBank;
 use slag_math::matrix::{Panels, Rows};
 
-/// Texts in 1,000 whose scores the likely error bounds.
+/// Share of texts that the likely error covers, in 1,000.
 const LIKELY_TEXTS: usize = 950;
-/// Of each of these texts, scores in 1,000 that are bounded.
+/// Share of such a text's scores within the bound, in 1,000.
 const LIKELY_SCORES: usize = 990;
 
 const SAMPLE: usize = 1024;
@@ -18,7 +18,7 @@ pub(crate) struct Sample<'a> {
     bank: &'a TextBank,
     texts: Panels,
     stride: usize,
-    /// Standard deviation over the sample of a text's scores, mean over the texts.
+    /// Standard deviation of a text's scores over the sample, mean over the texts.
     spread: f32,
     pub moments: ScoreMoments,
 }
@@ -51,13 +51,12 @@ impl<'a> Sample<'a> {
         Self { bank, texts, stride, spread, moments }
     }
 
-    /// Whether the Gaussian at a place of the order belongs to the sample.
+    /// `place`: in the order.
     pub fn has(&self, place: usize) -> bool {
         place.is_multiple_of(self.stride)
     }
 
-    /// Returns the errors of scores; zeros without embeddings. `missed`: the sample's embeddings minus their decoded
-    /// form, `[sample][dim]`.
+    /// Errors of scores; zeros without embeddings. `missed`: `[sample][dim]`, embeddings minus their decoded form.
     pub fn errors(&self, missed: &[f32]) -> ScoreErrors {
         if missed.is_empty() {
             return ScoreErrors { spread: self.spread, ..ScoreErrors::default() };
@@ -65,7 +64,7 @@ impl<'a> Sample<'a> {
         let mut errors = self.texts.product(Rows::all(missed, self.bank.dim));
         errors.par_iter_mut().for_each(|e| *e = e.abs());
         let n = errors.len();
-        // Gaussian by Gaussian: the sum is the same for any number of threads.
+        // By Gaussian, so that the sum does not depend on threads.
         let mean = errors
             .chunks(self.bank.n_texts())
             .map(|of_gaussian| of_gaussian.iter().map(|e| f64::from(*e)).sum::<f64>())
@@ -77,11 +76,9 @@ impl<'a> Sample<'a> {
     }
 }
 
-/// Returns a bound for a text like those held out, by split conformal prediction (Vovk, Gammerman and Shafer
-/// 2005): for 95 of 100 such texts, 99 of 100 scores err by no more.
-///
-/// `errors`: `[n][n_texts]`, absolute. The bound is the ceil(0.95 (h + 1))-th smallest of the h held-out texts'
-/// own 99th percentiles; `None` if that is more than h.
+/// Bounds scores of a text like those held out, by split conformal prediction (Vovk, Gammerman and Shafer 2005): for 95
+/// of 100 such texts, 99 of 100 scores err by no more. It is the ceil(0.95 (h + 1))-th smallest of the h held-out
+/// texts' own 99th percentiles; `None` if that is more than h. `errors`: `[n][n_texts]`, absolute.
 pub(crate) fn likely_error(
     errors: &[f32],
     n_texts: usize,
@@ -100,7 +97,7 @@ pub(crate) fn likely_error(
     (rank <= of_texts.len()).then(|| *of_texts.select_nth_unstable_by(rank - 1, f32::total_cmp).1)
 }
 
-/// Returns the standard deviation of each column of `[n][n_columns]`, averaged over the columns.
+/// Standard deviation of each column of `[n][n_columns]`, averaged over the columns.
 pub fn spread(scores: &[f32], n_columns: usize) -> f32 {
     if scores.is_empty() {
         return 0.0;
@@ -123,7 +120,7 @@ mod tests {
     use super::*;
     use slag_math::random::Random;
 
-    /// By hand: 19 texts, 3 Gaussians; the largest of the texts' largest errors. One text fewer says nothing.
+    /// By hand: 19 texts, 3 Gaussians; the largest of the texts' largest errors. One text fewer gives no bound.
     #[test]
     fn the_likely_error_is_that_of_the_ranks() {
         let errors: Vec<f32> = (0..3).flat_map(|k| (0..19).map(move |text| (text * 3 + k) as f32)).collect();

@@ -33,14 +33,14 @@ pub(crate) use fine::FineResiduals;
 const RMS_OF_MEAN: f32 = 1.35;
 /// Bytes of a centroid in a compact shard beside its components: start and radius.
 const BYTES_BESIDE_COMPONENTS: usize = 8;
-/// One centroid of an outlier for so many components of an embedding, in a cell of any size: a sixteenth of the
-/// bytes of its basis.
+/// One outlier centroid per this many components of an embedding, in a cell of any size: a sixteenth of the bytes of
+/// its basis.
 const OUTLIERS_OF_DIM: usize = 16;
 const CENTROID_STEP: f32 = 1.0 / 127.0;
-/// Share of the residual code's error budget that the dimensions without a component may take.
+/// Share of the residual code's error budget for the dimensions without a component.
 const TAIL_SHARE: f32 = 0.3;
 
-/// Returns the most bytes per embedding that building a codebook takes: components, residuals, codes.
+/// Most bytes per embedding while building a codebook: components, residuals, codes.
 pub(crate) fn working_bytes_per_embedding(dim: usize) -> usize {
     4 * dim.min(128) * size_of::<f32>() + 64
 }
@@ -80,15 +80,15 @@ impl Default for CodebookSettings {
     }
 }
 
-/// The metric and the texts that errors of scores are measured by.
+/// Metric and texts by which errors of scores are measured.
 pub struct ScoreMetricContext {
     pub metric: ScoreMetric,
     pub bank: TextBank,
-    /// Spread of a text's scores over the scene, as estimated beforehand.
+    /// Spread of a text's scores over the scene, estimated beforehand.
     pub spread: f32,
 }
 
-/// A cell's centroids and their members. Gaussians are in the order of the centroids.
+/// Gaussians are in the order of the centroids.
 pub struct Codebook {
     /// `[n]`: the given embeddings in the order of the centroids, then as given.
     pub order: Vec<u32>,
@@ -108,7 +108,7 @@ pub struct Codebook {
     pub radii: Vec<f32>,
     pub errors: ScoreErrors,
     pub moments: ScoreMoments,
-    /// The residual code; `None` if the centroids are good enough.
+    /// `None` if the centroids are good enough.
     pub residuals: Option<CodebookResiduals>,
 }
 
@@ -137,7 +137,7 @@ pub struct CodebookResiduals {
     pub fine: Option<FineResiduals>,
 }
 
-/// Builds the codebook of some unit embeddings. The result does not depend on threads.
+/// Takes unit embeddings. The result does not depend on threads.
 pub fn build(
     embeddings: Rows<'_>,
     score_context: &ScoreMetricContext,
@@ -179,7 +179,6 @@ pub fn build(
     }
 }
 
-/// Embeddings in the cell's coordinates, and their clusters.
 struct Clustered {
     basis: Basis,
     /// `[n][m]`.
@@ -208,12 +207,12 @@ impl Clustered {
     }
 }
 
-/// What the centroids leave of the points, each divided by its centroid's scale.
+/// Points minus their centroids, each divided by its centroid's scale.
 struct ScaledResiduals {
     m: usize,
     /// `[n][m]`, by point.
     residuals: Vec<f32>,
-    /// `[K]`: root mean square of the residuals.
+    /// `[K]`: RMS of the residuals.
     scales: Vec<f32>,
 }
 
@@ -229,7 +228,7 @@ impl ScaledResiduals {
         let scale = |centroid: usize| {
             let places = members.places(centroid);
             let n = places.len() as f64;
-            // At least 1e-6: members that coincide must not cause a division by zero.
+            // At least 1e-6, against division by zero where members coincide.
             ((places.map(squares).sum::<f64>() / n).sqrt() as f32).max(1e-6)
         };
         let scales: Vec<f32> = (0..members.starts.len() - 1).into_par_iter().map(scale).collect();
@@ -240,8 +239,7 @@ impl ScaledResiduals {
         Self { m, residuals, scales }
     }
 
-    /// Returns the residual code, if one is needed, and the rotation (rows `[m][m]`) to the residuals'
-    /// eigenvectors in the order of its components.
+    /// Residual code, if needed, and the rotation (rows `[m][m]`) to the residuals' eigenvectors in its order.
     fn plan(&self, codes: &[u32], max_rms: f32, max_subspaces: usize) -> (Option<ResidualCode>, Vec<f32>) {
         let m = self.m;
         let residuals = Rows::all(&self.residuals, m);
@@ -257,10 +255,10 @@ impl ScaledResiduals {
     }
 }
 
-/// Centroids and basis in 8 bits: each component has its own range, which goes into its basis vector.
+/// Centroids and basis in 8 bits; each component's range goes into its basis vector.
 struct StoredCentroids<'a> {
     mean: &'a [f16],
-    /// `[m]`: what a component of 1 stands for.
+    /// `[m]`: value of a component of 1.
     ranges: Vec<f32>,
     basis: Vec<i8>,
     basis_steps: Vec<f32>,
@@ -288,15 +286,14 @@ impl<'a> StoredCentroids<'a> {
         Decoder { dim, m, mean: self.mean, basis: &self.basis[..m * dim], steps: &self.basis_steps[..m] }
     }
 
-    /// Returns the centroids as readers decode them, `[K][dim]`.
+    /// The centroids as readers decode them, `[K][dim]`.
     fn decoded(&self) -> Vec<f32> {
         let components: Vec<f32> = self.centroids.iter().map(|v| f32::from(*v) * CENTROID_STEP).collect();
         self.decoder(self.ranges.len()).decode(&components)
     }
 }
 
-/// Returns the largest absolute value of each component. A lower bound keeps residuals within the range of half
-/// floats and readers.
+/// Largest absolute value of each component. A lower bound keeps residuals in the range of half floats and readers.
 fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
     let largest_scale = scales.iter().copied().fold(0.0, f32::max);
     let mut ranges = vec![(largest_scale / 8.0).max(1e-3); m];
@@ -306,7 +303,7 @@ fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
     ranges
 }
 
-/// Codes what the stored centroids leave, and measures what readers decode.
+/// Codes the residuals of the stored centroids, and measures what readers decode.
 fn code_residuals(
     code: ResidualCode,
     reference: &Reference<'_>,
@@ -324,7 +321,7 @@ fn code_residuals(
     });
     let (codes, mut decoded) = code.encode(Rows::all(&residuals, m));
     let covered = code.n_components();
-    // As readers decode: in the centroids' units, multiplied by the centroids' scales.
+    // As readers decode: in the centroids' units, times their scales.
     let mut residual_norms = vec![0.0f32; scales.len()];
     for centroid in 0..scales.len() {
         for at in members.places(centroid) {
@@ -341,7 +338,7 @@ fn code_residuals(
     CodebookResiduals { code, residual_scales: scales, residual_norms, codes, radii, errors, fine }
 }
 
-/// Returns the residuals of the stored centroids, in the order of the members, divided by the centroids' scales.
+/// Residuals of the stored centroids, in the order of the members, divided by the centroids' scales.
 fn residuals_of_stored(reference: &Reference<'_>, basis: &Basis, scales: &[f32]) -> Vec<f32> {
     let Reference { embeddings, members, decoded_centroids, .. } = *reference;
     let (m, dim) = (basis.n_components, embeddings.width);

@@ -8,23 +8,21 @@ use super::cluster::Clusters;
 use slag_math::dot;
 use slag_math::matrix::{Panels, Rows};
 
-/// One in so many Gaussians may get another centroid, the farthest from theirs.
+/// At most one in this many Gaussians, the farthest, may get another centroid.
 const OUTLIER_STEP: usize = 8;
 
 struct Outlier {
     at: usize,
-    /// Squared length of the embedding less the mean.
+    /// Of the embedding minus the mean.
     squared_length: f32,
     cluster: u32,
     squared_distance: f32,
 }
 
-/// Makes up to `n_more` centres out of the Gaussians farthest from theirs, one by one, each with the outliers that
-/// it is nearer to (Gonzalez 1985: as many other centres beside the given ones would leave about half of the
-/// radius at least).
-///
-/// Ends when no distance is above `enough`. `points`: the components of the embeddings, in which the clusters were
-/// found. Distances are those of the embeddings.
+/// Makes up to `n_more` centres out of the Gaussians farthest from theirs, one by one, each with the outliers that are
+/// nearer to it (Gonzalez 1985: as many other additional centres would leave at least about half of the radius). Ends
+/// when no distance exceeds `enough`. `points`: the embeddings' components, in which the clusters were found; distances
+/// are those of the embeddings.
 pub(super) fn separate(
     embeddings: Rows<'_>,
     basis: &Basis,
@@ -64,7 +62,7 @@ pub(super) fn separate(
         let centre = points.get(farthest.at);
         let length = squared_lengths(centre)[0];
         let left = distance(farthest.at, farthest.squared_length, centre, length);
-        // A centroid cannot reduce the part of an embedding that lies outside the basis.
+        // A centroid cannot reduce an embedding's part outside the basis.
         if farthest.squared_distance <= least || left >= farthest.squared_distance {
             break;
         }

@@ -13,18 +13,18 @@ use slag_math::eigen::eigen_symmetric;
 use slag_math::matrix::Rows;
 
 const TRAINING_SAMPLE: usize = 6144;
-/// Most components of a subspace: 16 codewords say little about each of more.
+/// Most components of a subspace: 16 codewords describe more too coarsely.
 const MAX_SUBSPACE_COMPONENTS: usize = 8;
 const SUBSPACES_STEP: usize = 4;
 
 pub struct ResidualCode {
     /// `[G + 1]`.
     pub subspace_starts: Vec<u32>,
-    /// Subspace by subspace, `[16][components of the subspace]`.
+    /// By subspace, `[16][components of the subspace]`.
     pub codewords: Vec<f16>,
 }
 
-/// Returns the rotation (rows `[m][m]`) to the residuals' eigenvectors, and their eigenvalues.
+/// Rotation (rows `[m][m]`) to the residuals' eigenvectors, and their eigenvalues.
 pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
     let m = residuals.width;
     let stride = residuals.len().div_ceil(TRAINING_SAMPLE).max(1);
@@ -41,7 +41,7 @@ pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
             }
             sums
         })
-        // Collected in order: the sums are the same for any number of threads.
+        // Collected in order, so that sums do not depend on threads.
         .collect::<Vec<_>>();
     let mut total = vec![0.0; m * m];
     moments.iter().for_each(|sums| total.iter_mut().zip(sums).for_each(|(t, s)| *t += s));
@@ -55,8 +55,8 @@ pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
     (vectors.into_iter().map(|v| v as f32).collect(), values)
 }
 
-/// Assigns components to subspaces with the least total loss. Returns the components in the order of their
-/// subspaces (those in none last), and the starts of the subspaces.
+/// Assigns components to subspaces with the least total loss. Returns the components by subspace (those in none last),
+/// and the starts of the subspaces.
 pub(crate) fn subspaces(variances: &[f64], n_subspaces: usize) -> (Vec<usize>, Vec<u32>) {
     let log = |c: usize| log_variance(variances[c]);
     let mut members: Vec<Vec<usize>> = (0..n_subspaces).map(|c| vec![c]).collect();
@@ -103,7 +103,7 @@ impl ResidualCode {
         Self { subspace_starts, codewords: codewords.concat() }
     }
 
-    /// Returns the code with each component of its codewords divided by a range, as they are stored.
+    /// Divides the components of the codewords by their ranges, as they are stored.
     pub(super) fn divided(mut self, ranges: &[f32]) -> Self {
         for starts in self.subspace_starts.windows(2) {
             let (from, to) = (starts[0] as usize, starts[1] as usize);
@@ -123,8 +123,7 @@ impl ResidualCode {
         self.subspace_starts[self.n_subspaces()] as usize
     }
 
-    /// Returns the codes of residuals, `[ceil(n / 32)][G / 2][32]`, and what they decode to,
-    /// `[n][components covered]`.
+    /// Codes `[ceil(n / 32)][G / 2][32]` of residuals, and their decoded form `[n][components covered]`.
     pub fn encode(&self, residuals: Rows<'_>) -> (Vec<u8>, Vec<f32>) {
         let (n_subspaces, covered) = (self.n_subspaces(), self.n_components());
         let codewords: Vec<f32> = self.codewords.iter().map(|w| w.to_f32()).collect();
@@ -164,9 +163,9 @@ fn nearest_codeword(residual: &[f32], codewords: &[f32]) -> usize {
     best.1
 }
 
-/// Returns the means of k-means, `n_codewords` at most.
+/// K-means; `n_codewords` at most.
 pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
-    /// Rounds after those of the clusters: the gain of more is below a hundredth.
+    /// Rounds after those of the clusters: more gain less than a hundredth.
     const ROUNDS: usize = 4;
     let mut codewords = clusters(points, 0.0, n_codewords).centres;
     for _ in 0..ROUNDS {
@@ -188,9 +187,8 @@ pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
     codewords
 }
 
-/// Returns the code with the fewest subspaces that leaves at most `max_rms` of the residuals, and the order of
-/// components that it needs; `None` if no code is needed, or if `max_subspaces` is below 2. `scales`: the divisor
-/// of each residual.
+/// Returns the shortest code that leaves at most `max_rms` of the residuals, and its order of components; `None` if
+/// none is needed, or if `max_subspaces` is below 2. `scales`: the divisor of each residual.
 pub fn plan(
     residuals: Rows<'_>,
     scales: &[f32],
@@ -230,8 +228,8 @@ pub fn plan(
         });
         (order, code, error)
     };
-    // The error of a short code shows how far the residuals are from the estimate's Gaussian ones. The needed
-    // length follows, and only that code is trained.
+    // The error of a short code shows how far the residuals are from the estimate's Gaussian ones; only the code of
+    // the length that follows is trained.
     let few = (2 * SUBSPACES_STEP).min(max_subspaces);
     let (order, code, error) = train(few);
     if error <= target || few == max_subspaces {
@@ -244,7 +242,7 @@ pub fn plan(
     Some((order, code))
 }
 
-/// Returns the mean squared error that a code of so many subspaces would leave of Gaussian residuals.
+/// Mean squared error that a code of this many subspaces would leave of Gaussian residuals.
 fn estimated_loss(variances: &[f64], n_subspaces: usize) -> f64 {
     let (order, starts) = subspaces(variances, n_subspaces);
     let of_subspace = |subspace: &[u32]| {
@@ -255,8 +253,7 @@ fn estimated_loss(variances: &[f64], n_subspaces: usize) -> f64 {
     starts.windows(2).map(of_subspace).sum::<f64>() + outside.iter().map(|c| variances[*c]).sum::<f64>()
 }
 
-/// Returns the loss of `d` Gaussian components coded in four bits, from the sum of the logarithms of their
-/// variances (rate distortion at equal loss).
+/// Loss of `d` Gaussian components in four bits, from their sum of log variances (rate distortion at equal loss).
 fn loss(d: usize, log_product: f64) -> f64 {
     d as f64 * ((log_product - 8.0 * std::f64::consts::LN_2) / d as f64).exp()
 }

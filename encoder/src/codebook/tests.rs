@@ -28,7 +28,6 @@ fn score_context(dim: usize, vectors: &[f32]) -> ScoreMetricContext {
     ScoreMetricContext { metric, bank, spread }
 }
 
-/// Writes a codebook as a shard of one profile and reads it back.
 fn shard_of(codebook: &Codebook, dim: usize, balanced: bool) -> AlignedBytes {
     let n = codebook.order.len() as u32;
     let residuals = codebook.residuals.as_ref().filter(|_| balanced);
@@ -133,7 +132,6 @@ fn bounds_and_errors_are_those_of_what_readers_decode() {
     }
 }
 
-/// The longest decoded residual of a centroid's members, as a vector of components.
 #[test]
 fn residual_norms_bound_decoded_residuals() {
     let (dim, n) = (64, 600);
@@ -213,7 +211,7 @@ fn centroids_follow_the_content_not_the_count() {
     assert!((250..=360).contains(&many), "{many} centroids for 300 clusters");
 }
 
-/// Cells of a handful of Gaussians: one centroid, which is their mean, and residuals as large as any.
+/// A handful of Gaussians: one centroid, which is their mean, and residuals as large as any.
 #[test]
 fn a_few_embeddings_are_finite() {
     for n in 1..=6 {
@@ -231,7 +229,7 @@ fn a_few_embeddings_are_finite() {
     }
 }
 
-/// Fewer components are fewer bytes a centroid and larger errors; the limit is only a limit.
+/// Fewer components take fewer bytes a centroid and have larger errors; `max_components` is only a limit.
 #[test]
 fn components_are_limited() {
     let vectors = clustered(600, 200, 64, 0.4);

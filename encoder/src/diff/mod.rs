@@ -75,7 +75,7 @@ pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, Dif
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Generation<'a> {
     pub(crate) reader: &'a StoreReader,
-    /// Its current generation or the one before it.
+    /// The current generation or the one before it.
     pub(crate) published: &'a Published,
 }
 
@@ -91,7 +91,7 @@ pub(crate) enum DiffError {
     Encoders { old: String, new: String },
 }
 
-/// Reads the objects of a generation, by id, and its cells, from the finest shards of each.
+/// Reads objects by id, and cells, from the finest shards of each.
 fn read_things(generation: Generation<'_>) -> Result<(Vec<Thing>, Vec<Place>), DiffError> {
     let manifest = &generation.published.manifest;
     let mut places = Vec::new();

@@ -9,8 +9,8 @@ use super::*;
 use crate::store::tests::manifest;
 use crate::store::{Extras, Store, StoreError, StoreReader};
 
-/// A shard whose things have a Gaussian each, unit boxes around x = their ids, and vectors along one axis. `seed`
-/// makes other bytes of the same things.
+/// A shard of things with a Gaussian each, unit boxes around x = their ids, and vectors along one axis. Another `seed`
+/// gives other bytes of the same things.
 fn shard(seed: u16, ids: &[u64]) -> Vec<u8> {
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(66.0) };
     let header = sample::header(0, ids.len(), 1, 2, bounds);
@@ -41,7 +41,7 @@ fn shard(seed: u16, ids: &[u64]) -> Vec<u8> {
     objects.add_to(&shard.view(), Additions::default())
 }
 
-/// A generation of a store with a cell for each list of shards, by profile.
+/// Publishes a generation with a cell for each list of shards, by profile.
 fn publish(
     store: &Store,
     generation: u64,
@@ -104,7 +104,7 @@ fn two_generations_of_a_store_by_hand() {
     assert_eq!(found.fetch_bytes, fetched);
 }
 
-/// Of the same splat: another outline is neither a thing that came nor one that went.
+/// Of the same splat, another outline is neither an added nor a removed thing.
 #[test]
 fn where_the_splat_is_the_same_nothing_changed() {
     let dir = tempfile::tempdir().expect("a folder");

@@ -27,8 +27,7 @@ pub enum EmbedError {
 }
 
 impl EmbedError {
-    /// Returns whether it lies in the crops or the photo: a model that cannot run fails on those of other views,
-    /// too.
+    /// Whether crops or photo are at fault; a model that cannot run fails on other views, too.
     pub(crate) fn is_of_crops(&self) -> bool {
         match self {
             Self::Mask { .. } => true,
@@ -40,14 +39,14 @@ impl EmbedError {
 }
 
 pub(crate) enum PatchUse {
-    /// Each of these patches is a region with a vector of its own; numbers row by row.
+    /// Each of these patches is a region with a vector of its own; row by row.
     Regions(Vec<usize>),
     Masks(Surroundings),
 }
 
 impl PatchUse {
-    /// Adds the vectors of regions to those of the crops, `[masks][dim]`, or mixes the patches into them; all are
-    /// unit vectors.
+    /// Appends the regions' vectors to those of the crops, `[masks][dim]`, or mixes the patches in; all are unit
+    /// vectors.
     pub(crate) fn add_to(
         &self,
         photo: &RgbImage,
@@ -73,23 +72,20 @@ impl PatchUse {
 /// Largest number of pixels in a batch of crops; large crops fill a batch before the encoder's preferred number.
 const MAX_BATCH_PIXELS: u64 = 1 << 21;
 
-/// Crops in a batch of an encoder on the processor, at most, unless model.toml asks for more.
+/// Most crops in a batch on the processor, unless model.toml says otherwise.
 const BATCH: u64 = 32;
 
-/// Returns the bytes of the crops that [`embed_masks`] holds of a photo of so many pixels: a batch, and one that is
-/// being cut.
+/// Bytes of the crops that [`embed_masks`] holds of a photo of this size: a batch, and one that is being cut.
 pub(crate) fn batch_bytes(squares: Option<&Preprocess>, photo_px: u64) -> u64 {
     let batch_px = match squares {
         Some(preprocess) => BATCH * u64::from(preprocess.size_px()).pow(2),
         None => MAX_BATCH_PIXELS.min(BATCH * photo_px),
     };
-    // Three colours, and whether it is inside the mask.
+    // Three colours, and whether the pixel is inside the mask.
     4 * (batch_px + photo_px)
 }
 
-/// Crops the image to the bounding box of a mask; pixels outside the mask become white.
-///
-/// Returns `None` if the mask does not fit the image or is empty.
+/// Crops the image to a mask's bounding box, white outside the mask; `None` if the mask is empty or does not fit.
 pub fn crop(image: &RgbImage, mask: &Mask) -> Option<Crop> {
     let BoxPx { x0, y0, x1, y1 } = mask.box_px;
     let fits = x0 < x1 && y0 < y1 && x1 <= image.width() && y1 <= image.height();
@@ -115,7 +111,7 @@ fn crop_of(image: &RgbImage, (index, mask): (usize, &Mask)) -> Result<Crop, Embe
     })
 }
 
-/// Returns the crop of each mask as the small square that the image encoder takes.
+/// Crops each mask to the small square that the image encoder takes.
 pub fn squares(image: &RgbImage, masks: &[Mask], preprocess: &Preprocess) -> Result<Vec<Crop>, EmbedError> {
     let square = |mask| Ok(Crop::whole(preprocess.square(crop_of(image, mask)?.image())));
     masks.iter().enumerate().map(square).collect()
@@ -135,10 +131,9 @@ pub(crate) fn embed_crops(
 }
 
 /// Returns a unit vector per mask, `[masks][dim]`. `squares`: how crops become the encoder's squares, if they do.
-///
-/// `batch`: crops given to the encoder at once, its own preference if `None`. Batches depend on the masks
-/// alone, so that models whose vectors vary with the batch (8-bit ones with scales found at run time)
-/// give the same ones on every machine. Memory: see [`batch_bytes`].
+/// `batch`: crops per call, the encoder's preference if `None`. Batches depend on the masks alone, so that models whose
+/// vectors vary with the batch (8-bit ones with scales found at run time) agree on every machine. Memory:
+/// [`batch_bytes`].
 pub fn embed_masks(
     image: &RgbImage,
     masks: &[Mask],

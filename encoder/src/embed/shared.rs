@@ -1,9 +1,9 @@
 //! Crops of several views in common batches, for image models on GPUs.
 //!
-//! A GPU is quickest with hundreds of crops at once, more than one view has. Views leave their crops in a queue
-//! and sleep until theirs are done; each lane has a thread that runs the next batch, with crops of whichever
-//! views. Nobody waits for a batch to be full: while the lanes are at work the queue grows, and batches with it.
-//! Views are woken one by one: all at once would be in the way of the threads that feed the GPUs.
+//! A GPU is quickest with hundreds of crops at once, more than one view has. Views queue their crops and sleep until
+//! these are done; each lane's thread runs the next batch, with crops of any views. Nobody waits for a full batch:
+//! while the lanes are at work the queue grows, and batches with it. Views are woken one by one: all at once would be
+//! in the way of the threads that feed the GPUs.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -15,17 +15,17 @@ use super::EmbedError;
 use crate::lanes::{GpuLoad, Lane, Lanes};
 use crate::memory::{MemoryPlan, Phase};
 
-/// Lanes of a GPU: two compute, one copies or is filled.
+/// Two compute, one copies or is filled.
 const LANES_PER_GPU: usize = 3;
 
-/// Views that may wait for each lane: with a usual number of masks they fill two batches.
+/// Views that may wait per lane: with a usual number of masks they fill two batches.
 const VIEWS_PER_LANE: usize = 12;
-/// Crops of so many views, or of fewer with many masks.
+/// Crops reserved per lane: of that many views, or of fewer with many masks.
 const CROPS_PER_LANE: u64 = 512;
 
 pub(crate) type OpenEncoder = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Send + Sync;
 
-/// Image encoders on GPUs that work off the crops of all views.
+/// Image encoders on GPUs, shared by the crops of all views.
 pub(crate) struct SharedEncoders {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
@@ -33,10 +33,9 @@ pub(crate) struct SharedEncoders {
 
 struct Shared {
     open: Box<OpenEncoder>,
-    /// Encoders are opened where they are first needed.
     lanes: Lanes<Option<Box<dyn ImageEncoder>>>,
     queue: Mutex<Queue>,
-    /// Wakes a lane's thread: there are crops, or there will be none.
+    /// Wakes a lane's thread for new crops or the end.
     has_work: Condvar,
 }
 
@@ -45,7 +44,7 @@ struct Queue {
     waiting: VecDeque<Waiting>,
     requests: BTreeMap<u64, Request>,
     next_request: u64,
-    /// Whether a batch ended in a panic, and its crops with it.
+    /// Whether a batch panicked and lost its crops.
     is_abandoned: bool,
     is_closed: bool,
 }
@@ -53,7 +52,7 @@ struct Queue {
 struct Waiting {
     crop: Crop,
     request: u64,
-    /// Its place among the request's crops.
+    /// Index among the request's crops.
     at: usize,
 }
 
@@ -61,7 +60,6 @@ struct Request {
     vectors: Vec<Vec<f32>>,
     n_left: usize,
     error: Option<Failure>,
-    /// Wakes its view.
     is_done: Arc<Condvar>,
 }
 
@@ -74,7 +72,7 @@ pub(crate) enum Failure {
 }
 
 impl SharedEncoders {
-    /// Returns encoders for the GPUs; `open` is called once a lane.
+    /// `open` is called once per lane.
     pub fn new(gpus: &[u32], open: Box<OpenEncoder>) -> Self {
         Self::with_lanes(gpus, LANES_PER_GPU, open)
     }
@@ -90,7 +88,7 @@ impl SharedEncoders {
         Self { shared, threads }
     }
 
-    /// Returns the number of views that should wait at once for the lanes to be at work.
+    /// Number of concurrently waiting views that keeps the lanes at work.
     pub fn n_views(gpus: &[u32]) -> usize {
         gpus.len() * LANES_PER_GPU * VIEWS_PER_LANE
     }
@@ -104,7 +102,6 @@ impl SharedEncoders {
         self.shared.lanes.loads()
     }
 
-    /// Takes a lane for work of the caller's own.
     pub(crate) fn with_encoder<T>(
         &self,
         work: impl FnOnce(&mut dyn ImageEncoder) -> T,
@@ -131,7 +128,7 @@ impl SharedEncoders {
         queue.waiting.extend(crops.into_iter().enumerate().map(waiting));
         self.shared.has_work.notify_one();
         while queue.requests.get(&own).is_some_and(|request| request.n_left > 0) {
-            // The panic that lost the crops is told by the thread that had it.
+            // The thread that panicked has printed the message.
             assert!(!queue.is_abandoned, "a batch of crops was lost");
             queue = is_done.wait(queue).unwrap_or_else(PoisonError::into_inner);
         }
@@ -185,11 +182,10 @@ impl Shared {
         Ok(lane.as_mut().expect("opened").as_mut())
     }
 
-    /// Runs the crops at the head of the queue, at most a batch.
     fn run_batch(&self, lane: &mut Lane<'_, Option<Box<dyn ImageEncoder>>>) -> Vec<Done> {
         let encoder = match self.opened(lane) {
             Ok(encoder) => encoder,
-            // The crops at the head wait for it in vain; all others find the same.
+            // The encoder cannot be opened: the first crop gets the error, and the others will, too.
             Err(error) => {
                 let Some(Waiting { request, at, .. }) = self.queue().waiting.pop_front() else {
                     return Vec::new();
@@ -220,7 +216,7 @@ impl Shared {
             };
             return places.into_iter().zip(vectors.chunks_exact(dim)).map(done).collect();
         }
-        // One by one, so that only the view of a bad crop fails.
+        // One by one, so that only the bad crop's view fails.
         let alone = |((request, at), crop): ((u64, usize), &Crop)| {
             let result = encoder.encode(std::slice::from_ref(crop));
             let failed = |cause: InferenceError| {
@@ -232,7 +228,7 @@ impl Shared {
     }
 }
 
-/// Tells the views that wait if it is dropped, which only a panic does.
+/// Dropped only by a panic; tells the waiting views.
 struct AbandonOnPanic<'l>(&'l Shared);
 
 impl Drop for AbandonOnPanic<'_> {
@@ -286,8 +282,7 @@ mod tests {
         }))
     }
 
-    /// Views of 1 to 29 crops: each gets the vectors that an encoder of its own gives, for any number of GPUs and
-    /// lanes.
+    /// Views of 1 to 29 crops get the vectors of an encoder of their own, for any number of GPUs and lanes.
     #[test]
     fn views_that_share_batches_get_the_vectors_of_their_own() {
         let models = ModelDir::embedded().expect("opens");
@@ -345,7 +340,6 @@ mod tests {
         });
     }
 
-    /// A model that does not open is an error for whoever waits.
     #[test]
     fn a_model_that_does_not_open_is_an_error_for_all() {
         let models = ModelDir::embedded().expect("opens");

@@ -3,26 +3,26 @@
 use crate::masks::patches::Windows;
 use crate::masks::{Mask, patches};
 
-/// Share of a mask's vector that is the mean of patches or windows; the rest is its crop's. Chosen on the labelled
-/// house and yard (docs/decisions.md).
+/// Share of the patches' or windows' mean in a mask's vector; the rest is the crop's. Chosen on the labelled house and
+/// yard (docs/decisions.md).
 const SHARE_OF_PATCHES: f32 = 0.5;
 const SHARE_OF_WINDOWS: f32 = 0.35;
 
-/// What the masks of a photo take of its vectors.
+/// Shares of a photo's vectors in its masks.
 pub(crate) struct Surroundings {
     share: f32,
-    /// `[masks]`: numbers of vectors of the photo, each with its share of the mean.
+    /// `[masks]`: indices of the photo's vectors, each with its share of the mean.
     of_mask: Vec<Vec<(usize, f32)>>,
 }
 
 impl Surroundings {
-    /// Of masks in the patches of a photo, `per_side` along each of its sides: by the mask's pixels in each.
+    /// Weighs the photo's patches, `per_side` along each side, by the mask's pixels in them.
     pub(crate) fn of_patches(masks: &[Mask], per_side: u32, (width_px, height_px): (u32, u32)) -> Self {
         let shares = |mask| patches::shares(mask, per_side, width_px, height_px);
         Self { share: SHARE_OF_PATCHES, of_mask: masks.iter().map(shares).collect() }
     }
 
-    /// Of masks in windows over a photo: by the mask's pixels in each, each size of windows alike.
+    /// Weighs windows by the mask's pixels in them; every size of windows counts the same.
     pub(crate) fn of_windows(masks: &[Mask], windows: &Windows) -> Self {
         let shares = |mask| windows.shares(mask);
         Self { share: SHARE_OF_WINDOWS, of_mask: masks.iter().map(shares).collect() }
@@ -32,8 +32,8 @@ impl Surroundings {
         self.of_mask.len()
     }
 
-    /// Mixes the direction of the mean of `of_photo`, `[vectors][dim]`, over each mask into its unit vector of
-    /// `of_masks`, `[masks][dim]`, which remains one. A mean without a direction changes nothing.
+    /// Mixes the direction of each mask's mean of `of_photo`, `[vectors][dim]`, into its unit vector of `of_masks`,
+    /// `[masks][dim]`, which stays unit. A mean without a direction changes nothing.
     pub(crate) fn mix(&self, of_masks: &mut [f32], of_photo: &[f32], dim: usize) {
         for (vector, shares) in of_masks.chunks_exact_mut(dim.max(1)).zip(&self.of_mask) {
             let mut mean = vec![0.0; dim];
@@ -51,7 +51,7 @@ impl Surroundings {
     }
 }
 
-/// Returns the vector's direction; `None` where it has none.
+/// `None` for a vector without a direction.
 fn unit(vector: &[f32]) -> Option<Vec<f32>> {
     let length = vector.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt() as f32;
     (length >= f32::EPSILON).then(|| vector.iter().map(|x| x / length).collect())
@@ -89,8 +89,7 @@ mod tests {
             (0..dim).for_each(|d| by_patch[d] += f64::from(of_patches[patch * dim + d]));
             let mut first = 0;
             for size in [1u32, 2, 4] {
-                // The windows of this size that contain the pixel: each covers two by two cells half a window
-                // wide.
+                // Windows of this size with the pixel: each covers two by two cells half a window wide.
                 let n = 2 * size - 1;
                 let cell =
                     |x: u32, edge: u32| ((f64::from(x) + 0.5) * f64::from(2 * size) / f64::from(edge)) as u32;

@@ -32,9 +32,8 @@ pub(super) struct CellMaker<'a> {
     pub(super) refinement: Refinement,
     pub(super) objects: Option<SceneObjects>,
     pub(super) occupancy: Option<SceneOccupancy>,
-    /// What errors of scores are measured by.
     pub(super) score_context: ScoreMetricContext,
-    /// Where the photos of each cell were taken, if its shards say so.
+    /// Camera poses by cell, if the shards store them.
     pub(super) photo_poses: Option<Vec<BuiltPhotoPoses>>,
     pub(super) landmarks: Option<Vec<BuiltLandmarks>>,
     pub(super) store: &'a Store,
@@ -44,11 +43,10 @@ pub(super) struct CellMaker<'a> {
 #[derive(Clone, Copy)]
 pub(super) struct CellsBudget {
     pub(super) group_bytes: u64,
-    /// Cells whose embeddings are held at once.
     pub(super) n_at_once: usize,
 }
 
-/// A cell whose parts are being lifted.
+/// A cell while its parts are lifted.
 struct CellInWork {
     embeddings: CellEmbeddings,
     fields: Vec<(String, Hash32)>,
@@ -61,26 +59,26 @@ impl CellInWork {
     }
 }
 
-/// A cell whose shards are kept.
+/// A cell whose shards are in the store.
 #[derive(Debug)]
 pub(super) struct FinishedCell {
     pub(super) record: CellRecord,
     pub(super) fields: Vec<(String, Hash32)>,
     pub(super) n_subspaces: u32,
     pub(super) n_without_evidence: u64,
-    /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
+    /// Over Gaussians with evidence: sums of mean score and mean squared score, and their number.
     pub(super) score_sums: [f64; 3],
 }
 
 impl CellMaker<'_> {
-    /// Lifts the cells and makes their shards, several at once.
+    /// Lifts cells and makes their shards, several at once.
     pub(super) fn build(
         &self,
         index: &ContributionIndex,
         budget: CellsBudget,
     ) -> Result<Vec<FinishedCell>, EncodeError> {
         let context = self.context;
-        // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
+        // A large cell's vectors are allocated once and reused, neither copied nor cleared.
         let free = (0..budget.n_at_once).map(|_| CellInWork::empty(self.table.dim())).collect();
         let lent = Lanes::new([(0, free)]);
         let take_emptied = || {
@@ -105,7 +103,7 @@ impl CellMaker<'_> {
                 let contributions = contributions?;
                 let cell_id = contributions.part.cell_id;
                 if contributions.part.locals.end < self.split.cells[cell_id as usize].gaussians.len() {
-                    // A large cell comes in parts, so that only one of them is held.
+                    // Large cells come in parts, so that only one part is held.
                     context.install(|| self.add_part(contributions, &mut cell))?;
                     continue;
                 }
@@ -130,7 +128,6 @@ impl CellMaker<'_> {
         if context.is_cancelled() { Err(ContributionError::Cancelled.into()) } else { Ok(finished) }
     }
 
-    /// Adds the next part's embeddings to its cell's, and keeps its field.
     fn add_part(
         &self,
         mut contributions: PartContributions,
@@ -153,7 +150,6 @@ impl CellMaker<'_> {
         Ok(())
     }
 
-    /// Makes a cell's codebook and shards from its embeddings, and keeps the shards.
     fn finish(&self, cell_id: u32, in_work: &mut CellInWork) -> Result<FinishedCell, EncodeError> {
         let cell = &self.split.cells[cell_id as usize];
         let Self { scene, settings, encoder_id, score_context, .. } = self;

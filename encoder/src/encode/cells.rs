@@ -1,7 +1,7 @@
 //! The third step: the contributions of all views become objects, fields and shards of every cell.
 //!
-//! Contributions are read cell by cell. Several cells at once are lifted and become codebooks and shards, as many
-//! as the memory plan holds. A cell's bytes do not depend on the others'.
+//! Contributions are read cell by cell. As many cells as the memory plan holds are lifted, coded and cut into shards
+//! at once. A cell's bytes do not depend on the others'.
 
 use std::path::PathBuf;
 
@@ -29,10 +29,9 @@ use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
 use crate::store::Extras;
 
-/// The cells of a scene, all objects of them in the store.
 pub(super) struct BuiltCells {
     pub(super) records: Vec<CellRecord>,
-    /// Subspaces of each cell's residual code.
+    /// By cell, of its residual code.
     pub(super) n_subspaces: Vec<u32>,
     pub(super) n_entries: Vec<u64>,
     pub(super) extras: Extras,
@@ -40,7 +39,7 @@ pub(super) struct BuiltCells {
     pub(super) objects: Option<ObjectsReport>,
     pub(super) occupancy: Option<OccupancyReport>,
     pub(super) counts: Counts,
-    /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
+    /// Over Gaussians with evidence: sums of mean score and mean squared score, and their number.
     score_sums: [f64; 3],
 }
 
@@ -61,7 +60,7 @@ impl BuiltCells {
         self.score_sums.iter_mut().zip(cell.score_sums).for_each(|(all, of_cell)| *all += of_cell);
     }
 
-    /// Returns how the bank of texts scores in all cells.
+    /// Mean and spread of the text bank's scores over all cells.
     pub(super) fn calibration(&self) -> Calibration {
         let [sum, squares, n] = self.score_sums;
         let mean = sum / n.max(1.0);
@@ -90,7 +89,7 @@ pub(super) fn build_cells(
         group_bytes: pass_bytes,
         cancel: context.cancel,
     };
-    // Before refinement adds superpoints to the regions.
+    // Before refinement adds superpoints as regions.
     let counts = Counts::of(views, &index, &table);
     let Refined { table, refinement, mut objects } = refine(plan, &scene, table, &score_context, context)?;
     if let Some(found) = &mut objects
@@ -136,14 +135,13 @@ pub(super) fn build_cells(
     Ok(built)
 }
 
-/// The regions with the superpoints that refinement adds, and the objects.
+/// The regions, with superpoints that refinement added, and the objects.
 struct Refined {
     table: RegionTable,
     refinement: Refinement,
     objects: Option<SceneObjects>,
 }
 
-/// Weighs masks, finds objects, and refines by both.
 fn refine(
     plan: &Plan<'_>,
     scene: &SceneContributions<'_>,
@@ -157,7 +155,7 @@ fn refine(
     let begin = || context.install(|| PendingRefinement::begin(settings.aggregation, scene, table));
     let pending = context.time("superpoints", begin)?;
     context.progress.advance(1);
-    // From all masks alike, whatever weight they have in the refinement.
+    // From all masks alike, whatever their weight in the refinement.
     context.begin_phase(Phase::Objects);
     let (views, superpoints) = (pending.table(), pending.superpoints());
     let find = || context.install(|| objects::find(scene, views, superpoints, score_context));
@@ -198,7 +196,6 @@ fn thumbnails(
     Ok(thumbnails)
 }
 
-/// Puts what later questions need beside the cells into the store.
 fn put_extras(plan: &Plan<'_>, table: &RegionTable, context: &RunContext<'_>) -> Result<Extras, EncodeError> {
     let Plan { store, settings, .. } = *plan;
     let mut extras = Extras::new();
@@ -211,7 +208,6 @@ fn put_extras(plan: &Plan<'_>, table: &RegionTable, context: &RunContext<'_>) ->
     Ok(extras)
 }
 
-/// Returns texts that queries are expected to be like.
 fn text_bank(plan: &Plan<'_>, context: &RunContext<'_>) -> TextBank {
     let models = plan.engines.models;
     context.time("texts", || match models.text_encoder(plan.engines.session) {
@@ -248,19 +244,18 @@ fn views_report(views: &DoneViews<'_>, index: &ContributionIndex) -> ViewsReport
     }
 }
 
-/// The contributions of the used views, and the memory for the steps that go over them.
+/// Contributions of the used views, and memory for the passes over them.
 struct Opened {
     index: ContributionIndex,
     table: RegionTable,
     score_context: ScoreMetricContext,
     photos: Vec<Photo>,
-    /// Bytes for the contributions that a pass of the refinement or of objects holds.
+    /// Bytes of contributions that a pass of refinement or objects may hold.
     pass_bytes: u64,
     cells: CellsBudget,
 }
 
 impl Opened {
-    /// Opens the contributions and checks the budget against them.
     fn of(
         plan: &Plan<'_>,
         views: &DoneViews<'_>,
@@ -296,8 +291,8 @@ impl Opened {
         }
         let pass_bytes = memory.rest(index.largest_part_bytes())?;
         let cell_bytes = shard::largest_cell_bytes(split, models.dim()) + index.largest_part_bytes();
-        // Cells come second: contributions that are not kept in memory are read six times. But what superpoints
-        // and objects took is free again.
+        // Cells come second: contributions that are not kept in memory are read six times. Memory of superpoints and
+        // objects is free again by then.
         let rest_bytes = memory.rest_of(Phase::Cells);
         let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
         let n_more =

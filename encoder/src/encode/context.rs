@@ -14,7 +14,6 @@ use crate::memory::{self, Phase};
 use crate::progress::Progress;
 use crate::raster::Rasterizer;
 
-/// What does the work of an encode.
 #[derive(Clone, Copy)]
 pub struct Engines<'a> {
     pub models: &'a ModelDir,
@@ -28,21 +27,19 @@ impl<'a> Engines<'a> {
     }
 }
 
-/// The time spent in each stage, added over all threads.
 #[derive(Default)]
 struct StageTimes(Mutex<BTreeMap<&'static str, f64>>);
 
 struct Began {
     phase: Phase,
     at: Instant,
-    /// The most memory of the process until then, bytes.
+    /// The process's peak memory until then, bytes.
     peak_before: Option<u64>,
 }
 
 pub(crate) struct RunContext<'a> {
     pub(super) start: Instant,
     pub(crate) progress: &'a dyn Progress,
-    /// Asks the run to stop.
     pub(crate) cancel: &'a AtomicBool,
     times: StageTimes,
     phases: Mutex<Vec<Began>>,
@@ -63,13 +60,13 @@ impl<'a> RunContext<'a> {
     }
 
     pub(super) fn begin_phase(&self, phase: Phase) {
-        // Before anything of the phase is there, so that phases do not come on top of each other.
+        // Before the phase allocates, so that phases' memory does not add up.
         memory::give_back();
         let began = Began { phase, at: Instant::now(), peak_before: memory::peak_bytes() };
         self.phases.lock().unwrap_or_else(PoisonError::into_inner).push(began);
     }
 
-    /// Returns the phases so far, of which the last one ends at `end`: they add up to the time since the start.
+    /// Phases so far, the last one until `end`: they add up to the time since the start.
     pub(super) fn phases(&self, end: Instant) -> Vec<PhaseReport> {
         let phases = self.phases.lock().unwrap_or_else(PoisonError::into_inner);
         let began = phases.iter().skip(1).map(|Began { at, peak_before, .. }| (*at, *peak_before));
@@ -86,7 +83,7 @@ impl<'a> RunContext<'a> {
         self.cancel.load(Ordering::Relaxed)
     }
 
-    /// Runs work on the run's threads: parallel iterators inside use these alone.
+    /// Runs work, with its parallel iterators, on the run's threads only.
     pub(crate) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.workers.run(false, work)
     }
@@ -105,13 +102,13 @@ impl<'a> RunContext<'a> {
     }
 }
 
-/// Stack of a thread: while it waits for others' part of its work, it may take up another piece.
+/// While a thread waits for parts of its work, it may take up another piece on the same stack.
 const STACK_BYTES: usize = 8 << 20;
 
 pub(crate) struct Workers {
-    /// For all work that is not done alone, and for steps that wait for a device and need threads in between.
+    /// For work on all threads, and steps that wait for a device and need threads in between.
     pub(crate) shared: ThreadPool,
-    /// Pools of one thread that have no work; made as they are needed.
+    /// Idle pools of one thread, made as needed.
     alone: Mutex<Vec<ThreadPool>>,
 }
 
@@ -124,15 +121,14 @@ impl Workers {
         Ok(Self { shared: start(n_threads)?, alone: Mutex::default() })
     }
 
-    /// Returns how many of `n_pieces`, the first ones, get a thread of their own where `n_at_once` are worked on
-    /// at a time.
+    /// Returns how many of the first `n_pieces` get a thread of their own, with `n_at_once` worked on at a time.
     pub(crate) fn n_alone(&self, n_pieces: usize, n_at_once: usize) -> usize {
         let n_threads = self.shared.current_num_threads();
-        // Fewer pieces than threads would leave threads without work.
+        // Fewer pieces than threads would leave threads idle.
         if n_threads == 1 || n_at_once < n_threads { 0 } else { n_pieces - n_pieces % n_at_once }
     }
 
-    /// Runs a piece of work on a thread of its own, or on all threads. The caller is none of them and only waits.
+    /// Runs work on one thread of its own, or on all threads; the caller only waits.
     pub(crate) fn run<T: Send>(&self, is_alone: bool, work: impl FnOnce() -> T + Send) -> T {
         let free = || self.alone.lock().unwrap_or_else(PoisonError::into_inner);
         let pool = is_alone.then(|| free().pop().map_or_else(|| start(1), Ok));
@@ -142,7 +138,7 @@ impl Workers {
                 free().push(pool);
                 result
             }
-            // Where the system starts no more threads, those that there are do it.
+            // If the system refuses another thread, the shared ones do it.
             Some(Err(_)) | None => self.shared.install(work),
         }
     }
@@ -156,7 +152,7 @@ mod tests {
 
     use super::*;
 
-    /// Pieces that wait for each other end only if each has a thread; the parts of one are done by that thread.
+    /// Pieces that wait for each other end only if each has its own thread, which does all of its parts.
     #[test]
     fn each_piece_has_a_thread_of_its_own() {
         let workers = Workers::start(3).expect("starts");

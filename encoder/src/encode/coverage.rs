@@ -1,19 +1,18 @@
 //! Which views to take first: those that together show the most of the scene, known before any mask is paid for.
 //!
-//! A raster of low resolution gives the blending weight `a(k, v) = Σ_p alpha T` of each Gaussian `k` over a view
-//! `v` without its margin, at which the photo's edge cuts things off: the solid angle that is seen of it, which
-//! falls with the square of the distance, with the cosine of the angle, and with what stands in front. It counts
-//! twice, each time against the best view of the same Gaussian: the lift weighs a view by it, and the crops that
-//! the view gives are as much finer. A set of views `S` is worth
+//! A raster of low resolution gives the blending weight `a(k, v) = Σ_p alpha T` of each Gaussian `k` over a view `v`
+//! without its margin, where the photo's edge cuts things off. It is the visible solid angle: it falls with the square
+//! of the distance, with the cosine of the angle, and with occlusion. It is squared, relative to the Gaussian's best
+//! view: the lift weighs a view by it, and the view's crops are as much finer. A set of views `S` is worth
 //!
 //! ```text
 //! f(S) = Σ_k g(Σ_{v in S} q(k, v))     q(k, v) = (a(k, v) / max_v a(k, v))^2     g(x) = ln(1 + s x)
 //! ```
 //!
-//! `f` is monotone and submodular, because `g` is growing and concave: so the first `n` views of the greedy order
-//! are worth at least `1 - 1/e` of the best `n` (Nemhauser, Wolsey and Fisher 1978, for every `n` at once). Gains
-//! only fall, so most need not be computed again (Minoux 1978). All contributions are integers: the order does not
-//! depend on threads, and equal gains go by the views' names.
+//! `f` is monotone and submodular, because `g` is increasing and concave: the first `n` views of the greedy order are
+//! worth at least `1 - 1/e` of the best `n`, for every `n` (Nemhauser, Wolsey and Fisher 1978). Gains only fall, so
+//! most need not be computed again (Minoux 1978). Contributions are integers, so the order does not depend on threads;
+//! equal gains go by the views' names.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -25,27 +24,26 @@ use serde::Serialize;
 use crate::masks::{NO_REGION, RegionMap};
 use crate::raster::{LoadedScene, RasterError, RasterView};
 
-/// Width of the raster, pixels: a Gaussian that is smaller than a pixel there is smaller than any mask.
+/// Width of the raster, pixels: a Gaussian smaller than its pixel is smaller than any mask.
 const WIDTH_PX: u32 = 192;
-/// Width of the margin, in parts of the view's width and height.
+/// As a share of the view's width and height.
 const MARGIN: f64 = 0.05;
-/// Most pairs of a Gaussian and a view that are kept, 8 bytes each; of larger scenes every n-th Gaussian counts.
+/// Most pairs of a Gaussian and a view, 8 bytes each; larger scenes use every n-th Gaussian.
 const MAX_PAIRS: usize = 1 << 26;
 const MAX_GAUSSIANS: usize = 1 << 17;
-/// Steps of a quality of 1; what is less than half of one, a twentieth of the best view, does not show a Gaussian.
+/// Steps of a quality of 1. Less than half a step, a twentieth of the best view, does not show a Gaussian.
 const QUALITY_STEPS: f32 = 255.0;
 /// Sums of qualities above this, 257 best views, gain nothing more.
 const MAX_SUM: usize = u16::MAX as usize;
-/// `s` of `g`: how soon another view of the same gains little.
+/// `s` of `g`: how fast the gain of similar views falls.
 const STEEPNESS: f64 = 2.0;
-/// Steps of `g` = 1; at [`MAX_SUM`] a step of quality still is 2^8 of them.
+/// Steps of `g` = 1; at [`MAX_SUM`] a step of quality is still 2^8 of them.
 const GAIN_STEPS: f64 = (1 << 24) as f64;
 
-/// How well each view shows each Gaussian.
 #[derive(Clone, Debug)]
 pub struct Coverage {
     n_gaussians: usize,
-    /// For each view the Gaussians that it shows, and their qualities in steps.
+    /// By view: its Gaussians, and their qualities in steps.
     views: Vec<(Vec<u32>, Vec<u8>)>,
     /// `g` by the sum of qualities, in steps of both.
     gain_of_sum: Vec<u32>,
@@ -61,7 +59,7 @@ pub struct CoverageReport {
 }
 
 impl Coverage {
-    /// Rasterises every view of a loaded scene of `n_gaussians`; `None` if cancelled.
+    /// `None` if cancelled.
     pub fn measure(
         scene: &dyn LoadedScene,
         n_gaussians: usize,
@@ -76,13 +74,13 @@ impl Coverage {
             }
             weights(scene, view, stride).map(Some).map_err(|source| (number, source))
         });
-        // Of several errors the first view's, whatever thread was faster.
+        // Of several errors, the first view's, so that the result does not depend on threads.
         let seen: Vec<_> = seen.collect::<Vec<_>>().into_iter().collect::<Result<_, _>>()?;
         let Some(seen) = seen.into_iter().collect::<Option<Vec<_>>>() else { return Ok(None) };
         Ok(Some(Self::new(n_gaussians.div_ceil(stride as usize), seen)))
     }
 
-    /// Makes qualities of the weights that each view gives Gaussians below `n_gaussians`.
+    /// Turns each view's weights of Gaussians below `n_gaussians` into qualities.
     fn new(n_gaussians: usize, weights: Vec<Vec<(u32, f32)>>) -> Self {
         let mut best = vec![0.0f32; n_gaussians];
         weights.iter().flatten().for_each(|(k, a)| best[*k as usize] = best[*k as usize].max(*a));
@@ -96,18 +94,18 @@ impl Coverage {
         let mut step = u32::MAX;
         for sum in 1..=MAX_SUM {
             let exact = GAIN_STEPS * (STEEPNESS * sum as f64 / f64::from(QUALITY_STEPS)).ln_1p();
-            // Rounding must not make a step larger than the one before: the guarantee needs g concave.
+            // Rounding must not increase a step: the guarantee needs concave g.
             step = step.min(exact.round() as u32 - gain_of_sum[sum - 1]);
             gain_of_sum.push(gain_of_sum[sum - 1] + step);
         }
         Self { n_gaussians, views, gain_of_sum }
     }
 
-    /// Returns all views, each the one that gains most after those before it.
+    /// Orders all views greedily by gain.
     pub fn order(&self) -> Vec<usize> {
         let mut contributions = vec![0u16; self.n_gaussians];
         let first: Vec<u64> = self.views.par_iter().map(|view| self.gain(&contributions, view)).collect();
-        // (gain, earliest name, how many were chosen when the gain was computed)
+        // (gain, earliest name, number of chosen views when the gain was computed)
         let mut heap: BinaryHeap<_> =
             first.into_iter().enumerate().map(|(view, gain)| (gain, Reverse(view), 0)).collect();
         let mut order = Vec::with_capacity(self.views.len());
@@ -122,7 +120,7 @@ impl Coverage {
         order
     }
 
-    /// Returns how much of what all views show a choice of them shows.
+    /// Compares what the chosen views show with what all views show.
     pub fn report(&self, chosen: impl IntoIterator<Item = usize>) -> CoverageReport {
         let worth = |views: &mut dyn Iterator<Item = usize>| {
             let mut contributions = vec![0u16; self.n_gaussians];
@@ -133,7 +131,7 @@ impl Coverage {
         };
         let all = worth(&mut (0..self.views.len()));
         let reached = worth(&mut chosen.into_iter());
-        // A scene that no view shows is shown wholly.
+        // A scene that no view shows counts as covered.
         let share = |part: f64, whole: f64| if whole > 0.0 { part / whole } else { 1.0 };
         CoverageReport { coverage: share(reached.0, all.0), seen: share(reached.1, all.1) }
     }
@@ -156,7 +154,7 @@ impl Coverage {
     }
 }
 
-/// Returns every `stride`-th Gaussian that a view shows, numbered in strides, with its weight within the margin.
+/// Weights within the margin of every `stride`-th visible Gaussian, numbered in strides.
 fn weights(scene: &dyn LoadedScene, view: &RasterView, stride: u32) -> Result<Vec<(u32, f32)>, RasterError> {
     let intrinsics = view.intrinsics.without_distortion();
     let intrinsics = intrinsics.scaled_to_width(WIDTH_PX.min(intrinsics.width_px));
@@ -167,7 +165,7 @@ fn weights(scene: &dyn LoadedScene, view: &RasterView, stride: u32) -> Result<Ve
     Ok(counted.map(|entry| (entry.gaussian / stride, entry.weight)).collect())
 }
 
-/// Returns a raster whose pixels, but for the margin, are one region.
+/// A raster with one region: all pixels but the margin.
 fn inner(width_px: u32, height_px: u32) -> RegionMap {
     let is_inner = |at: u32, n: u32| {
         let margin = (MARGIN * f64::from(n)) as u32;
@@ -178,8 +176,7 @@ fn inner(width_px: u32, height_px: u32) -> RegionMap {
     RegionMap { width_px, height_px, n_regions: 1, region_of_pixel }
 }
 
-/// Returns the numbers below `n` so that those before any place are about evenly spread: by their reversed bits
-/// (van der Corput 1935).
+/// Numbers below `n`, ordered so that every prefix is about evenly spread: by reversed bits (van der Corput 1935).
 pub(crate) fn spread_order(n: usize) -> Vec<usize> {
     let n_bits = n.next_power_of_two().trailing_zeros();
     let reversed = |i: usize| i.reverse_bits().checked_shr(usize::BITS - n_bits).unwrap_or(0);
@@ -202,7 +199,6 @@ mod tests {
         (0..n_views).map(|_| view()).collect()
     }
 
-    /// The definition in f64, of a set of views.
     fn worth(weights: &[Vec<(u32, f32)>], n_gaussians: usize, chosen: &[usize]) -> f64 {
         let mut best = vec![0.0f64; n_gaussians];
         weights.iter().flatten().for_each(|(k, a)| best[*k as usize] = best[*k as usize].max((*a).into()));
@@ -213,8 +209,8 @@ mod tests {
         contributions.iter().map(|sum: &f64| (STEEPNESS * sum).ln_1p()).sum()
     }
 
-    /// Oracle: every set of n views, and the definition in f64; the bound of Nemhauser, Wolsey and Fisher holds
-    /// for every n, and each step of the order is the best one but for the steps of the tables.
+    /// Oracle: every set of n views, and the definition in f64. The bound of Nemhauser, Wolsey and Fisher holds for
+    /// every n, and each step is the best one but for the tables' steps.
     #[test]
     fn the_order_keeps_the_guarantee() {
         let mut random = Random::new(1);
@@ -243,11 +239,11 @@ mod tests {
                 );
             }
         }
-        // Far above the bound, as greedy mostly is; a random order is not.
+        // Greedy is far above the bound; a random order is not.
         assert!(least > 0.9, "{least}");
     }
 
-    /// Lazily evaluated, the order is that of computing every gain anew, ties included.
+    /// Lazy evaluation gives the order of computing every gain anew, ties included.
     #[test]
     fn lazy_is_plain_greedy() {
         let mut random = Random::new(2);
@@ -271,7 +267,7 @@ mod tests {
         }
     }
 
-    /// What the guarantee needs of the table.
+    /// The guarantee needs this of the table.
     #[test]
     fn gains_grow_and_never_faster() {
         let coverage = Coverage::new(0, Vec::new());
@@ -284,8 +280,8 @@ mod tests {
         }
     }
 
-    /// A wall of Gaussians in front of another: the view that sees the wall alone, near, far and aslant, and one
-    /// from behind. The hidden wall is seen from behind only, so that view is second; near before far and aslant.
+    /// A wall in front of another: views of the front wall near, far and aslant, and one from behind. Only that one
+    /// shows the hidden wall, so it is second; near comes before far and aslant.
     #[test]
     fn occlusion_distance_and_angle_count() {
         let place = |i: i32| {

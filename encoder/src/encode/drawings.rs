@@ -11,10 +11,10 @@ use super::error::EncodeError;
 use super::settings::EncodeSettings;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
 
-/// Version of plan and drawing; another number is another plan.
+/// Version of plan and drawings; a change redraws them.
 const PLAN_VERSION: u32 = 3;
 
-/// Draws the planned views of a splat beside the poses file of the settings, unless they are there.
+/// Draws a splat's planned views beside the poses file, unless they are there.
 pub(super) fn make(
     settings: &EncodeSettings,
     planned: &ViewpointSettings,
@@ -53,7 +53,6 @@ pub(super) fn make(
     Ok(())
 }
 
-/// Returns the hash of everything that decides plan and drawings.
 fn identity(scene: &Gaussians, planned: &ViewpointSettings, device: &str) -> Result<Hash32, EncodeError> {
     let columns: [&[u8]; 6] = [
         bytemuck::cast_slice(&scene.means_in_world),
@@ -68,7 +67,7 @@ fn identity(scene: &Gaussians, planned: &ViewpointSettings, device: &str) -> Res
     Ok(Hash32::of(&serde_json::to_vec(&of).map_err(std::io::Error::from)?))
 }
 
-/// Returns whether a poses file, which is written last, is of a plan.
+/// Whether a poses file, which is written last, belongs to this plan.
 fn is_there(poses: &Path, id: Hash32) -> bool {
     let text = fs_err::read(poses).ok();
     let found = text.and_then(|text| serde_json::from_slice::<Value>(&text).ok());

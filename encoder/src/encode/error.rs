@@ -100,7 +100,7 @@ pub enum EncodeError {
 }
 
 impl EncodeError {
-    /// Returns whether the error lies in one view's input, so that the other views may go on.
+    /// Returns whether one view's input is at fault, so that the other views may go on.
     pub(crate) fn is_of_one_view(&self) -> bool {
         match self {
             Self::Ingest(_)
@@ -120,8 +120,8 @@ mod tests {
 
     use super::*;
 
-    /// Too many masks, what overflows in half precision on some photos only, and a crop without pixels or with a vector
-    /// of no length must not end the encode of all others, at every resume; a model that fails on one fails on others.
+    /// Too many masks, overflow of half precision on some photos, and a crop without pixels or with a zero vector must
+    /// not end the encode of all others at every resume; a model that fails on one view fails on others.
     #[test]
     fn what_one_view_is_at_fault_for() {
         let path = PathBuf::new();

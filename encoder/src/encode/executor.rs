@@ -8,12 +8,12 @@ use super::plan::Plan;
 use super::report::{SkippedView, StageReport};
 use super::sink::ViewRecord;
 
-/// Does the views of an encode. The result is the same whoever does them.
+/// Does the views of an encode; the result does not depend on the executor.
 pub(crate) trait Executor {
-    /// Returns what rasterises the views, as far as their contributions depend on it.
+    /// Names the rasteriser, as far as contributions depend on it.
     fn rasterizer(&self, engines: &Engines<'_>) -> String;
 
-    /// Does the views of the plan's order that are not done, and leaves their contributions in the plan's job.
+    /// Does the remaining views in the plan's order, and leaves their contributions in the plan's job.
     ///
     /// # Errors
     /// [`EncodeError`]; finished views stay finished.
@@ -32,8 +32,7 @@ pub(crate) trait Executor {
 
 pub(crate) struct ViewsRun {
     pub(crate) stages: Vec<StageReport>,
-    /// Views left out for an error.
     pub(crate) skipped: Vec<SkippedView>,
-    /// The device that ran the image model, if it ran.
+    /// Device of the image model, if it ran.
     pub(crate) images_on: Option<String>,
 }

@@ -1,8 +1,7 @@
 //! The measured front of settings, and the choice of one for a target of seconds or bytes.
 //!
-//! `slag-lab bench tradeoff` writes it. Seconds are a sum of two shares: those of the views grow with their
-//! number, the others with the number of Gaussians. Photos of another size, other models or another machine need a
-//! front of their own.
+//! `slag-lab bench tradeoff` writes it. Seconds of the views grow with their number, all others with the number of
+//! Gaussians. Photos of another size, other models or another machine need a front of their own.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -35,7 +34,7 @@ pub struct FrontSetting {
     pub miou: f64,
 }
 
-/// What a user accepts; at least one of the two.
+/// At least one of the two.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Target {
     pub seconds: Option<f64>,
@@ -82,7 +81,7 @@ impl Front {
         Ok(front)
     }
 
-    /// Returns the most accurate setting that is expected to meet the target, the quicker one of equals.
+    /// Returns the most accurate setting expected to meet the target, the quicker one of equals.
     pub fn choose(
         &self,
         target: Target,
@@ -135,7 +134,7 @@ mod tests {
         }
     }
 
-    /// By hand: 100 photos and half a million Gaussians take 100 times the view's seconds and 5 more.
+    /// By hand: 100 photos and half a million Gaussians take 100 times the view's seconds, and 5 more.
     #[test]
     fn the_best_setting_within_the_target_is_chosen() {
         let settings = vec![

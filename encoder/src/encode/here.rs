@@ -35,7 +35,7 @@ impl Executor for Here {
         let deadline = run.time_budget.and_then(|budget| context.start.checked_add(budget));
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let mut budget = Budget { has_some: views().any(|view| done.contains_key(&view.name)) };
-        // After ctrl-c no view is begun; those in work are finished.
+        // After ctrl-c no view begins; those under way are finished.
         let n_alone = context.workers.n_alone(open.clone().count(), run.threads);
         let source = open
             .take_while(|_| !context.is_cancelled() && budget.may_begin(is_over()))
@@ -65,8 +65,8 @@ impl Executor for Here {
     }
 }
 
-/// Takes views through their stages: each with whether it has a thread of its own. `on_bad_view` is told of an
-/// error that lies in one view's input; the view then ends.
+/// Takes views through their stages, each on a thread of its own or on all. `on_bad_view` gets errors of one view's
+/// input; the view then ends.
 ///
 /// # Errors
 /// Those of the stages that lie in no view, and those of `on_bad_view`.
@@ -82,14 +82,13 @@ pub(crate) fn work_off<'v>(
     let source = source.map(|(is_alone, view)| (is_alone, Work::begin(view, is_here)));
     let done = pipeline::run(&list, n_threads, source, |at, (is_alone, work)| {
         let view = work.view();
-        // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
+        // Stages that wait for a device or the disk must not hold a thread of the run.
         let result = match list[at].on_cpu {
             true => context.workers.run(is_alone, || stages.step(work)),
             false => stages.step(work),
         };
         match result {
-            // One bad photo or mask file of a thousand must not end an encode. A model that fails on one view
-            // fails on the others too.
+            // One bad file of a thousand must not end an encode; a model that fails on one view fails on all.
             Err(error) if error.is_of_one_view() => on_bad_view(view, error).map(|()| None),
             result => result.map(|work| Some((is_alone, work?))),
         }
@@ -98,9 +97,8 @@ pub(crate) fn work_off<'v>(
     done
 }
 
-/// Lets views begin until the time is over, but always a first one.
+/// Lets views begin until the time is over, at least one.
 struct Budget {
-    /// Whether a view is done or begun.
     has_some: bool,
 }
 

@@ -12,18 +12,18 @@ use crate::cells::PositionError;
 use crate::ingest;
 use crate::segment::Segmenter;
 
-/// Version of the steps from masks to contributions; another number is another encode.
+/// Version of the steps from masks to contributions; a change makes another encode.
 const REGIONS_VERSION: u32 = 4;
 
-/// Stands for the rasterisers of a fleet: its machines have different ones.
+/// Stands for a fleet's rasterisers, which differ between machines.
 #[cfg(feature = "fleet")]
 pub(crate) const OF_A_FLEET: &str = "fleet";
 
 pub(super) struct Identities {
-    /// Hash of everything on which the contributions of all views depend.
+    /// Hash of everything that the contributions of all views depend on.
     pub(super) of_scene: Hash32,
-    /// `[n_views]`: hash of everything on which the contributions of a view depend, in the order of the views.
-    /// That includes `of_scene`, but no other view: photos can be added and withdrawn.
+    /// `[n_views]`: hash of everything that a view's contributions depend on, in the order of the views. It includes
+    /// `of_scene`, but no other view, so photos can be added and withdrawn.
     pub(super) of_view: Vec<Hash32>,
 }
 
@@ -82,7 +82,7 @@ pub(super) fn identities(
     Ok(Identities { of_scene, of_view: of_view.collect::<Result<_, _>>()? })
 }
 
-/// Returns the hash of everything on which the contributions of a view depend, as its files are now.
+/// Hash of everything that a view's contributions depend on, from its files as they are now.
 pub(super) fn of_view(
     of_scene: Hash32,
     view: &View,
@@ -98,7 +98,7 @@ pub(super) fn of_view(
     })
 }
 
-/// Returns the hash of everything on which the contributions of all views depend, done by a fleet.
+/// Hash of everything that all views' contributions depend on, in a fleet.
 #[cfg(feature = "fleet")]
 pub(crate) fn of_scene(
     settings: &ViewSettings,
@@ -207,7 +207,7 @@ mod tests {
         assert!(of("cpu") != of("NVIDIA H100 F64") && of("cpu") != of(OF_A_FLEET) && of("cpu") == of("cpu"));
     }
 
-    /// Files count by content, where path and length are the same; so do masks in a single COCO file.
+    /// Files of equal path and length differ by content; so do masks in a single COCO file.
     #[test]
     fn photos_and_masks_count_by_content() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -250,7 +250,7 @@ mod tests {
             with(&|settings, _| settings.cells.limits.max_gaussians -= 1),
         ];
         assert!(changed.iter().all(|identity| *identity != plain));
-        // What is made of the views' contributions is no part of it.
+        // Later steps are no part of the identity.
         assert_eq!(with(&|settings, _| settings.aggregation = crate::lift::Aggregation::PLAIN), plain);
     }
 }

@@ -18,31 +18,31 @@ use crate::ground::Standing;
 use crate::memory::{MemoryPlan, Phase};
 use crate::{check, ingest};
 
-/// A splat of which fewer than one in so many Gaussians can be seen is damaged.
+/// A splat is damaged if fewer than one in this many Gaussians can be seen.
 const MIN_VISIBLE_ONE_IN: usize = 20;
 
-/// Bytes that a pixel of a photo takes while it is worked on: three as read and three without distortion, one for
-/// whether the lens shows it, four each for its depth and its segment, and its masks.
+/// Bytes per pixel of a photo in work: three as read and three without distortion, one for validity, four each for
+/// depth and segment, and its masks.
 const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4 + MASK_BYTES_PER_PX;
-/// Of these, while it waits: its colours, whether the lens shows it, its depth, its masks.
+/// The same while it waits: colours, validity, depth, masks.
 const WAITING_BYTES_PER_PX: u64 = 3 + 1 + 4 + MASK_BYTES_PER_PX;
-/// A bit for each pixel in the box of a mask: of 32 masks as large as the photo, or of hundreds as they are.
+/// One bit per pixel of a mask's box: 32 masks as large as the photo, or hundreds of usual ones.
 const MASK_BYTES_PER_PX: u64 = 4;
 
 pub(crate) struct Inputs {
     pub(crate) scene: Gaussians,
     pub(crate) split: CellSplit,
     pub(crate) standing: Arc<Standing>,
-    /// The views whose photo exists, in the order of their names.
+    /// Views with a photo, by name.
     pub(crate) views: Vec<View>,
-    /// The views whose photo is missing, in the same order.
+    /// Views without a photo, in the same order.
     pub(super) missing: Vec<SkippedView>,
     pub(super) geo_reference: Option<GeoReference>,
     pub(super) n_drawn: usize,
 }
 
 impl Inputs {
-    /// Reads scene, poses and geo-reference, and cuts the scene into cells.
+    /// Reads scene, poses and geo-reference, and splits the scene into cells.
     pub(super) fn read(settings: &EncodeSettings, context: &RunContext<'_>) -> Result<Self, EncodeError> {
         let inputs = &settings.inputs;
         let geo_reference = inputs.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
@@ -51,7 +51,7 @@ impl Inputs {
         inputs.activated.undo(&mut scene);
         let (set, n_drawn) = read_views(inputs)?;
         let damaged = set.damaged;
-        // Drawings are drawn where the splat is.
+        // Drawings share the splat's world.
         if ingest::drawn_from(&inputs.views).is_none() {
             ingest::to_poses(&mut scene, &inputs.scene, &inputs.splat_frame, set.source, set.applied)?;
         }
@@ -105,7 +105,7 @@ pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
     memory.reserve(Phase::Always, "the scene", scene.len_bytes());
 }
 
-/// Reserves the largest photos: those that threads work on, and those that wait for a device or in a queue.
+/// Reserves the largest photos: those in work, and those that wait for a device or in a queue.
 pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work: usize, n_under_way: usize) {
     let areas_px = areas_px(views);
     let (in_work, rest) = areas_px.split_at(n_in_work.min(areas_px.len()));
@@ -114,7 +114,7 @@ pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work:
     memory.reserve(Phase::Views, "photos that wait", waiting_px * WAITING_BYTES_PER_PX);
 }
 
-/// Reserves the crops of the largest photos that threads work on. `crops_bytes`: by the pixels of the photo.
+/// Reserves the crops of the largest photos in work. `crops_bytes`: by the photo's pixels.
 pub(super) fn reserve_crops(
     memory: &mut MemoryPlan,
     views: &[View],
@@ -130,14 +130,14 @@ pub(super) fn reserve_thumbnails(memory: &mut MemoryPlan, views: &[View], n_thre
     memory.reserve(Phase::Refine, "photos that thumbnails are cut from", in_work_px * PHOTO_BYTES_PER_PX);
 }
 
-/// Returns the areas of photos, largest first.
+/// Areas of photos, largest first.
 fn areas_px(views: &[View]) -> Vec<u64> {
     let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
     areas_px.sort_unstable_by(|a, b| b.cmp(a));
     areas_px
 }
 
-/// Returns the numbers of views with a photo and of Gaussians.
+/// Numbers of views with a photo, and of Gaussians.
 pub(crate) fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeError> {
     let scene = splat::read(&inputs.scene, &ReadOptions { with_sh_rest: false })?;
     if let Some(planned) = &inputs.planned {
@@ -147,7 +147,7 @@ pub(crate) fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), Enc
     Ok((views.len() - ingest::missing_images(&views).len(), scene.len()))
 }
 
-/// Reads the poses of every nth frame, and counts those whose images are drawings.
+/// Reads the poses of every nth frame, and counts the drawings.
 fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
     let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;
     set.notes.iter().for_each(|note| tracing::warn!("{note}"));
@@ -167,8 +167,7 @@ fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
     Ok((set, n_drawn))
 }
 
-/// Adds the views of another poses file, and returns how many are drawings. `first`: the file of those that are
-/// there, for errors.
+/// Adds the views of another poses file; returns the number of drawings. `first`: the first file, for errors.
 fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, EncodeError> {
     let added = poses::read(path, None)?;
     if added.applied != set.applied {
@@ -199,7 +198,6 @@ fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError
     Ok(())
 }
 
-/// Sets aside views without a photo.
 fn find_views(
     settings: &EncodeSettings,
     views: Vec<View>,
@@ -240,9 +238,8 @@ mod tests {
         assert!(error.contains("--cell-gaussians and --cell-width-m"), "{error}");
     }
 
-    /// By hand: a photo of 400 x 300 pixels, whose file is absent, and two of 40 x 30, which their headers say, of
-    /// the same camera. Two are worked on, 19 bytes a pixel; of two more that may wait there is one, 12 bytes a
-    /// pixel.
+    /// By hand: a camera with a photo of 400 x 300 px, absent, and two of 40 x 30 by their headers. Two are in work, 19
+    /// bytes a pixel; of two more that may wait there is one, 12 bytes a pixel.
     #[test]
     fn photos_are_reserved_by_their_files_in_work_and_waiting() {
         let folder = tempfile::tempdir().expect("a folder");

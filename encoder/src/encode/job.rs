@@ -19,7 +19,7 @@ use crate::store::Store;
 
 const TREE: &str = "job";
 const IDENTITY_KEY: &[u8] = b"identity";
-/// Present while every finished view of the job is published.
+/// Present if every finished view of the job is published.
 const PUBLISHED_KEY: &[u8] = b"published";
 const STEP_KEY: &[u8] = b"step";
 const VIEW_PREFIX: &str = "view/";
@@ -36,8 +36,7 @@ pub(crate) struct JobStatus {
     pub step: Option<String>,
 }
 
-/// Returns the state of the encode that a store keeps views of, if there is one. `db`: the store's catalogue, or a
-/// copy.
+/// State of the store's kept views, if there are any. `db`: the store's catalogue, or a copy.
 pub(crate) fn job_status(db: &sled::Db) -> Result<Option<JobStatus>, EncodeError> {
     let tree = db.open_tree(TREE)?;
     if !tree.contains_key(IDENTITY_KEY)? {
@@ -51,18 +50,17 @@ pub(crate) fn job_status(db: &sled::Db) -> Result<Option<JobStatus>, EncodeError
     }))
 }
 
-/// The unfinished encode of a store.
 pub(crate) struct Job {
     records: sled::Tree,
     folder: PathBuf,
     of_scene: Hash32,
-    /// The identity of each view of this encode, by name.
+    /// By name.
     id_of_view: BTreeMap<String, Hash32>,
 }
 
 impl Job {
-    /// Takes up what an encode of the same scene left, or begins one. Views that it has done are done here, too,
-    /// where their identities are the same and their files are sound. `id_of_view`: by name.
+    /// Resumes an earlier encode of the same scene, or begins one. Views with the same identity and sound files count
+    /// as done. `id_of_view`: by name.
     pub(super) fn open(
         store: &Store,
         of_scene: Hash32,
@@ -76,7 +74,7 @@ impl Job {
         let found = job.records.get(IDENTITY_KEY)?;
         let same = found.as_deref() == Some(&of_scene.0);
         let published = job.records.contains_key(PUBLISHED_KEY)?;
-        // A published job loses only its contributions, which the published generation does not need.
+        // A published job loses only contributions, which the published generation does not need.
         if found.is_some() && !same && restart == Restart::Never && !published {
             return Err(EncodeError::OtherJob {
                 path: store.dir().to_owned(),
@@ -94,8 +92,8 @@ impl Job {
         Ok(job)
     }
 
-    /// Drops the views of this encode that are recorded as done, but whose files are lost or damaged: they are made
-    /// again. The entries of contributions have checksums of their own, which the lift sees.
+    /// Drops done views whose files are lost or damaged, so that they are made again. The lift checks the
+    /// contributions' entries by their own checksums.
     fn drop_damaged(&self) -> Result<(), EncodeError> {
         for (view, id) in &self.id_of_view {
             if !self.records.contains_key(record_key(*id))? {
@@ -115,15 +113,14 @@ impl Job {
         Ok(())
     }
 
-    /// Checks the files of a view, but for the entries of its contributions.
+    /// Checks a view's files, except the entries of its contributions.
     fn check_files(&self, view: &str) -> Result<(), ContributionError> {
         let (_, regions) = ContributionFile::open(&self.contributions_path(view))?;
         let n_masks = regions.mask_vectors.len() / regions.dim;
         photos::read_outlines(&self.outlines_path(view), n_masks).map(drop)
     }
 
-    /// Drops the view whose kept files an error names, so that the next encode makes it again, and returns the error
-    /// that says so.
+    /// Drops the view whose file an error names, so that the next encode makes it again; returns an error that says so.
     pub(super) fn forget_damaged(&self, error: ContributionError) -> EncodeError {
         let ContributionError::Damaged { path, source } = &error else { return error.into() };
         let stem = path.file_stem().and_then(|stem| stem.to_str());
@@ -138,7 +135,7 @@ impl Job {
         }
     }
 
-    /// Drops the record and then the files of a view.
+    /// Drops first the record, then the files.
     fn forget(&self, id: Hash32) -> Result<(), EncodeError> {
         self.records.remove(record_key(id))?;
         self.flush()?;
@@ -151,24 +148,21 @@ impl Job {
         Ok(())
     }
 
-    /// Returns the views of this encode whose contributions are on disk.
     pub(crate) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
         let mut done = BTreeMap::new();
         for (name, id) in &self.id_of_view {
             if let Some(value) = self.records.get(record_key(*id))? {
-                // The record feeds the report alone.
+                // A lost record only affects the report.
                 done.insert(name.clone(), serde_json::from_slice(&value).unwrap_or_default());
             }
         }
         Ok(done)
     }
 
-    /// Returns the file of a view's contributions.
-    ///
     /// # Panics
     /// If the view is none of this encode's.
     pub(crate) fn contributions_path(&self, view: &str) -> PathBuf {
-        // By identity: a photo that is replaced gets another file, and a record never names the old one's.
+        // By identity: a replaced photo gets another file, so no record names the old one's.
         self.views_folder().join(format!("{}.contributions", self.id_of_view[view]))
     }
 
@@ -176,14 +170,11 @@ impl Job {
         self.contributions_path(view).with_extension("outlines")
     }
 
-    /// Returns the hash of everything on which the contributions of all views depend.
     #[cfg(feature = "fleet")]
     pub(crate) fn of_scene(&self) -> Hash32 {
         self.of_scene
     }
 
-    /// Returns the identity of a view.
-    ///
     /// # Panics
     /// If the view is none of this encode's.
     #[cfg(feature = "fleet")]
@@ -191,10 +182,10 @@ impl Job {
         self.id_of_view[view]
     }
 
-    /// Marks a view as done, whose files are durable.
+    /// Marks a view as done; its files must be durable.
     pub(crate) fn mark_done(&self, view: &str, record: ViewRecord) -> Result<(), EncodeError> {
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
-        // In one step: with a view that was not published, the job may no longer be dropped silently.
+        // Atomic: with an unpublished view, the job may no longer be dropped silently.
         let mut batch = sled::Batch::default();
         batch.insert(record_key(self.id_of_view[view]), record);
         batch.remove(PUBLISHED_KEY);
@@ -202,8 +193,7 @@ impl Job {
         self.flush()
     }
 
-    /// Keeps the contributions of published views, for an encode that adds other views. Those of photos that are
-    /// none of this encode's go.
+    /// Keeps the contributions of this encode's published views, for an encode that adds others.
     pub(super) fn keep_published(self) -> Result<(), EncodeError> {
         self.forget_others()?;
         self.records.insert(PUBLISHED_KEY, &[])?;
@@ -215,7 +205,6 @@ impl Job {
         self.flush()
     }
 
-    /// Returns whether the store keeps views of an encode of this scene.
     pub(super) fn is_kept(store: &Store, of_scene: Hash32) -> Result<bool, EncodeError> {
         let tree = store.db().open_tree(TREE)?;
         let found = tree.get(IDENTITY_KEY)?;
@@ -226,7 +215,7 @@ impl Job {
         self.clear()
     }
 
-    /// Removes the records and files of views that are none of this encode's.
+    /// Removes records and files of views that are none of this encode's.
     fn forget_others(&self) -> Result<(), EncodeError> {
         let own: BTreeSet<String> = self.id_of_view.values().map(Hash32::to_string).collect();
         let mut batch = sled::Batch::default();
@@ -247,8 +236,8 @@ impl Job {
         Ok(())
     }
 
-    /// Takes up the files of a job whose records are lost: a catalogue that was made anew has none. A file of
-    /// contributions is renamed into place when it and its outlines are whole.
+    /// Adopts files of a job whose records were lost with the catalogue. A file of contributions is renamed into place
+    /// once it and its outlines are whole.
     fn adopt(&self) -> Result<(), EncodeError> {
         if self.records.contains_key(IDENTITY_KEY)? {
             return Ok(());
@@ -286,14 +275,14 @@ impl Job {
         self.clear_steps(3)
     }
 
-    /// Does the first steps of [`Self::clear`]; after each, a crash leaves this job or none.
+    /// Does the first steps of [`Self::clear`]; a crash after any leaves this job or none.
     fn clear_steps(&self, n_steps: usize) -> Result<(), EncodeError> {
-        // Without it, nothing takes the files up again once their records are gone.
+        // First, so that nothing adopts the files once their records are gone.
         if n_steps > 0 && self.identity_path().exists() {
             fs_err::remove_file(self.identity_path())?;
             durable::sync_folder(&self.folder)?;
         }
-        // A file without a record is redone, a record without a file would be an error.
+        // Records before files: a file without a record is redone, a record without a file would be an error.
         if n_steps > 1 {
             self.records.clear()?;
             self.flush()?;
@@ -315,7 +304,7 @@ impl ViewSink for Job {
         1
     }
 
-    /// As both were read by now, they had the content that the identity names where they have it still.
+    /// Both were read by now: if they still have the planned content, they had it then.
     fn check_unchanged(&self, view: &View, segmenter: &dyn Segmenter) -> Result<(), EncodeError> {
         let now = identity::of_view(self.of_scene, view, segmenter)?;
         match now == self.id_of_view[&view.name] {
@@ -324,7 +313,7 @@ impl ViewSink for Job {
         }
     }
 
-    /// The files come first, then the record that marks the view as done.
+    /// Writes the files first, then the record that marks the view as done.
     fn keep(
         &self,
         view: &View,
@@ -338,13 +327,12 @@ impl ViewSink for Job {
     }
 }
 
-/// Returns what an error found, without its advice to delete the file.
+/// An error's finding, without its advice to delete the file.
 fn first_clause(error: &ContainerError) -> String {
     let text = error.to_string();
     text.split("; ").next().unwrap_or_default().to_owned()
 }
 
-/// Returns whether a file is gone, or shorter than it says.
 fn is_lost(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::UnexpectedEof)
 }
@@ -376,8 +364,7 @@ mod tests {
         Job::open(store, Hash32([of_scene; 32]), id_of_view, Restart::Never)
     }
 
-    /// A view is done where its identity is: photos come, go and are replaced, and what none of them is goes when
-    /// the views are published.
+    /// A view is done if its identity is: photos come, go and are replaced; leftovers go when the views are published.
     #[test]
     fn views_are_known_by_their_identities() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -388,7 +375,7 @@ mod tests {
         keep(&job, "b");
         let of_b = job.contributions_path("b");
         assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("c", 3)]).expect("goes on")), ["a"]);
-        // Another photo of the same name is not done, and does not take the place of the old one's file.
+        // Another photo of the same name is not done, and does not replace the old one's file.
         let replaced = open_with(&store, 1, &[("b", 4)]).expect("goes on");
         assert!(names(&replaced).is_empty());
         keep(&replaced, "b");
@@ -402,8 +389,8 @@ mod tests {
         assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
     }
 
-    /// Records that are lost with the catalogue are made again from the files: nothing is done twice, and another
-    /// scene does not drop them.
+    /// Records that are lost with the catalogue are rebuilt from the files: nothing is redone, and another scene does
+    /// not drop them.
     #[test]
     fn a_job_outlives_its_records() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -423,7 +410,7 @@ mod tests {
         assert!(matches!(open_with(&store, 2, &[("a", 1)]), Err(EncodeError::OtherJob { n_done: 1, .. })));
     }
 
-    /// A published job that a crash left half dropped neither comes back nor keeps another scene out.
+    /// A published job, half dropped by a crash, neither comes back nor keeps another scene out.
     #[test]
     fn a_job_that_was_dropped_in_part_stays_dropped() {
         for n_steps in 0..=3 {
@@ -438,8 +425,8 @@ mod tests {
         }
     }
 
-    /// Every way in which a kept file can be lost, cut or damaged, but for entries: the view is made again, and no
-    /// other. A view is done again once its files are.
+    /// Every way to lose, cut or damage a kept file, except its entries: only that view is made again, and is done once
+    /// its files are.
     #[test]
     fn views_with_damaged_files_are_made_again() {
         for (number, damage) in DAMAGES.iter().enumerate() {
@@ -461,8 +448,7 @@ mod tests {
         }
     }
 
-    /// A checksum that the lift finds wrong names its file: the record of that view goes, and the error says what to
-    /// do.
+    /// A wrong checksum found by the lift: that view's record goes, and the error says what to do.
     #[test]
     fn a_view_that_the_lift_finds_damaged_is_forgotten() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -479,7 +465,6 @@ mod tests {
         assert_eq!(job.done_views().expect("reads").into_keys().collect::<Vec<_>>(), ["b"]);
     }
 
-    /// `--restart` drops the views of the same encode, too.
     #[test]
     fn a_restart_takes_nothing_over() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -492,7 +477,7 @@ mod tests {
         }
     }
 
-    /// A published job may be dropped, but not the views that a later run adds to it before it is published again.
+    /// A published job may be dropped, but not views that a later run adds before publishing again.
     #[test]
     fn views_added_to_a_published_job_are_not_dropped_silently() {
         let dir = tempfile::tempdir().expect("a folder");

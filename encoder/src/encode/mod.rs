@@ -1,10 +1,9 @@
 //! The pipeline: photos, poses and a splat in, a published generation of shards out.
 //!
-//! Views are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet.
-//!
-//! Views are independent: a killed encode resumes after the last finished view, if it is the same encode
-//! (`identity.rs`). The later steps read the contributions in the order of the views' names, so the store's bytes
-//! do not depend on threads, on the order of views or on interruptions.
+//! Views are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet. They are independent: a
+//! killed encode resumes after the last finished view, if it is the same encode (`identity.rs`). Later steps read
+//! contributions in the order of the views' names, so the store's bytes do not depend on threads, on the order of views
+//! or on interruptions.
 
 mod cell;
 mod cells;
@@ -51,7 +50,6 @@ pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
 pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, Restart, ViewOrder, ViewsLimit};
 
-/// The parts of which a fleet makes its own encode.
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet_parts {
     pub(crate) use super::context::RunContext;
@@ -64,7 +62,7 @@ pub(crate) mod fleet_parts {
     pub(crate) use super::view::{ViewStages, ViewTools};
 }
 
-/// Encodes a scene into a store and publishes the result as its next generation.
+/// Encodes a scene into a store and publishes it as the next generation.
 ///
 /// # Errors
 /// [`EncodeError`]; the store keeps its current generation, and finished views are not done again.
@@ -77,7 +75,7 @@ pub fn encode(
     encode_by(&here::Here, settings, engines, progress, cancel)
 }
 
-/// Encodes a scene as [`encode`] does. `executor` does the views.
+/// Like [`encode`]; `executor` does the views.
 pub(crate) fn encode_by(
     executor: &dyn Executor,
     settings: &EncodeSettings,
@@ -95,7 +93,7 @@ pub(crate) fn encode_by(
     });
     let is_begun = || ["job", "drawn", "manifest"].iter().any(|name| folder.join(name).exists());
     if encoded.is_err() && is_new && folder.exists() && !is_begun() {
-        // What was refused before any work leaves no empty store behind.
+        // A refusal before any work leaves no empty store behind.
         fs_err::remove_dir_all(folder)?;
     }
     encoded
@@ -107,7 +105,7 @@ fn encode_into(
     engines: &Engines<'_>,
     context: &RunContext<'_>,
 ) -> Result<EncodeSummary, EncodeError> {
-    // First of all, so that a second encode into the same store fails at once.
+    // First, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.output.store)?;
     store.check_keys()?;
     if let Some(planned) = &settings.inputs.planned {
@@ -129,7 +127,7 @@ fn encode_into(
         EncodeError::Contributions(ContributionError::Cancelled) => {
             EncodeError::Interrupted { n_done: n_views, n_views }
         }
-        // Checksums of contributions are first seen here: the next encode must not meet the same file again.
+        // Checksums of contributions are checked only here; the next encode must not meet the file again.
         EncodeError::Contributions(error) => plan.job.forget_damaged(error),
         error => error,
     })?;

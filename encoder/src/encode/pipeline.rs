@@ -1,9 +1,8 @@
 //! Views on their way through stages that overlap: while a device has one view, the cores prepare the next.
 //!
-//! Each stage has as many slots as views may be in it at once, and a queue as long. A free thread takes the view
-//! that is furthest, so that views leave before others come in and the memory is that of few. Stages of the
-//! processor share its cores; one that waits for a GPU or the disk takes none from them. On a processor alone this
-//! is a thread a core, each with a view.
+//! Each stage has as many slots as views may be in it at once, and a queue as long. A free thread takes the most
+//! advanced view, so that views leave before others enter and few are in memory. Stages on the processor share its
+//! cores; one that waits for a GPU or the disk takes none. Without devices this is a thread a core, each with a view.
 
 use std::any::Any;
 use std::collections::VecDeque;
@@ -17,33 +16,33 @@ use super::report::StageReport;
 #[derive(Clone, Debug)]
 pub(super) struct Stage {
     pub(super) name: &'static str,
-    /// Views that may be in it at once, at least 1.
+    /// Most views in it at once, at least 1.
     pub(super) n_slots: usize,
-    /// Whether it keeps a core busy, rather than a GPU or a disk.
+    /// Whether it keeps a core busy rather than a GPU or a disk.
     pub(super) on_cpu: bool,
 }
 
-/// Returns the most items that are in some stages at once, or wait between them.
+/// Most items in a range of stages, or waiting between them.
 pub(super) fn most_under_way(stages: &[Stage], of: RangeInclusive<usize>, n_cores: usize) -> usize {
     let (first, last) = (*of.start(), *of.end());
     let is_fed_back = |at: usize| !stages[at].on_cpu && stages[at..].iter().any(|stage| stage.on_cpu);
     if !(first..stages.len()).any(is_fed_back) {
-        // A core that has brought an item through a stage takes it through the next one.
+        // A core takes an item straight on to the next stage.
         return n_cores;
     }
-    // What is in a stage has its place in the next one's queue.
+    // An item in a stage has its place in the next queue reserved.
     let n_places = |at: usize| stages[at].n_slots.max(stages[at + 1].n_slots);
     (first..last).map(n_places).sum::<usize>() + stages[last].n_slots
 }
 
 struct Schedule<T, E> {
-    /// Waiting before each stage but the first.
+    /// Before each stage but the first.
     waiting: Vec<VecDeque<T>>,
     n_running: Vec<usize>,
     is_asking: bool,
-    /// Whether the source had nothing, and no step has ended since it was asked.
+    /// The source had nothing, and no step has ended since.
     has_no_more: bool,
-    /// Steps that have ended, and had when the source was asked.
+    /// Ended steps, now and when the source was asked.
     n_ended: usize,
     n_ended_when_asked: usize,
     busy_secs: Vec<f64>,
@@ -56,16 +55,14 @@ enum Failure<E> {
 }
 
 enum Task<T> {
-    /// Asks the source for an item, and takes it through the first stage.
     Begin,
     Step(usize, T),
 }
 
-/// Takes what `source` yields through the stages, `n_cores` at a time on the processor. A source that has nothing
-/// may have more later: it is asked again whenever a stage has room, until nothing is under way. It may take its
-/// time: stages go on meanwhile.
+/// Takes items of `source` through the stages, `n_cores` at a time on the processor. A source that has nothing is
+/// asked again whenever a stage has room, until nothing is under way; it may block, while stages go on.
 ///
-/// `step` does the work of a stage (its index) and returns what the next one takes; `None` ends an item's way.
+/// `step` does a stage's work (by index) and returns the next stage's input; `None` ends an item.
 ///
 /// # Errors
 /// The first that `step` returned; what is under way is then given up.
@@ -128,7 +125,7 @@ impl<S, F> Pipeline<'_, S, F> {
         let mut schedule = lock();
         while schedule.failure.is_none() {
             let Some((at, task)) = schedule.take(self.stages, self.n_cores) else {
-                // Where nothing is under way and nothing can be begun, nothing waits.
+                // Nothing is under way and nothing can begin.
                 if schedule.n_running.iter().all(|n| *n == 0) {
                     break;
                 }
@@ -136,7 +133,7 @@ impl<S, F> Pipeline<'_, S, F> {
                 continue;
             };
             drop(schedule);
-            // A panic must not leave the others waiting.
+            // A panic must not leave the other threads waiting.
             let done = panic::catch_unwind(AssertUnwindSafe(|| match task {
                 Task::Step(stage, item) => Some(self.timed_step(stage, item)),
                 Task::Begin => {
@@ -162,16 +159,16 @@ impl<S, F> Pipeline<'_, S, F> {
     }
 }
 
-/// Seconds and result of a step, if the source had an item for it.
+/// Seconds and result of a step; `None` if the source had no item for it.
 type StepOutcome<T, E> = Option<(f64, Result<Option<T>, E>)>;
 
 impl<T, E> Schedule<T, E> {
-    /// Takes the item that is furthest of those that can go on, and says into which stage.
+    /// Takes the most advanced item that can go on, with its stage.
     fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, Task<T>)> {
         let on_cpu = stages.iter().zip(&self.n_running).filter(|(stage, _)| stage.on_cpu);
         let has_core = on_cpu.map(|(_, n)| n).sum::<usize>() < n_cores;
         for (at, stage) in stages.iter().enumerate().rev() {
-            // What is in the stage has its place in the next one's queue, which holds enough for either's slots.
+            // An item in the stage has its place in the next queue, which is as long as either's slots.
             let has_room = stages.get(at + 1).is_none_or(|next| {
                 self.waiting[at + 1].len() + self.n_running[at] < stage.n_slots.max(next.n_slots)
             });
@@ -199,7 +196,6 @@ impl<T, E> Schedule<T, E> {
         self.has_no_more = !has_item && self.n_ended == self.n_ended_when_asked;
     }
 
-    /// Puts an item into the next queue, or keeps why there is none.
     fn end_step(&mut self, at: usize, done: std::thread::Result<StepOutcome<T, E>>) {
         self.n_running[at] -= 1;
         let (secs, result) = match done {
@@ -231,7 +227,7 @@ mod tests {
         Stage { name, n_slots, on_cpu }
     }
 
-    /// Every item passes every stage in order; slots, cores and queues are never exceeded; nothing is lost.
+    /// Every item passes all stages in order; slots, cores and queues are never exceeded; nothing is lost.
     #[test]
     fn slots_cores_and_queues_are_kept() {
         let stages = [
@@ -270,7 +266,7 @@ mod tests {
         })
         .expect("no error");
         assert_eq!(done.into_inner().expect("not poisoned").len(), 200);
-        // A queue before each of four stages, of 3, 3, 3 and 3 with what comes into it, and 3 in the last one.
+        // Four queues of 3 each, with the items on their way in, and 3 in the last stage.
         let most = most_under_way.into_inner();
         assert!((4..=15).contains(&most), "{most}");
         assert_eq!(reports.len(), 5);
@@ -282,7 +278,7 @@ mod tests {
         }
     }
 
-    /// While a device has the first item, the only core prepares the second: the device returns only then.
+    /// The only core prepares the second item while a device has the first, which it keeps until then.
     #[test]
     fn a_device_does_not_stop_the_cores() {
         let stages = [stage("prepare", 1, true), stage("device", 1, false)];
@@ -301,7 +297,6 @@ mod tests {
         .expect("no error");
     }
 
-    /// The furthest item goes first, so that few are under way.
     #[test]
     fn what_is_furthest_goes_first() {
         let stages = [stage("a", 1, true), stage("b", 1, true), stage("c", 1, true)];
@@ -337,7 +332,6 @@ mod tests {
         assert!(n_begun.load(Ordering::SeqCst) < 100);
     }
 
-    /// Threads that wait for the source's next item end with it.
     #[test]
     #[should_panic(expected = "a broken source")]
     fn a_panic_of_the_source_is_passed_on() {
@@ -346,7 +340,7 @@ mod tests {
         let _ = run::<_, ()>(&stages, 2, source, |_, item| Ok(Some(item)));
     }
 
-    /// A source that takes its time, as a queue of a fleet does, holds up no stage.
+    /// A source that blocks, such as a fleet's queue, holds up no stage.
     #[test]
     fn stages_go_on_while_the_source_is_asked() {
         let stages = [stage("a", 2, true), stage("b", 2, false)];
@@ -367,8 +361,8 @@ mod tests {
         .expect("no error");
     }
 
-    /// By hand: cores take items all the way; with a device in between, each boundary holds as many as either side
-    /// has slots.
+    /// By hand: cores take items all the way; with a device between, each boundary holds as many as either side's
+    /// slots.
     #[test]
     fn items_under_way_are_bounded() {
         let of_cpu = [stage("a", 3, true), stage("b", 3, true), stage("disk", 1, false)];

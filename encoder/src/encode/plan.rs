@@ -39,17 +39,16 @@ pub(crate) struct Plan<'a> {
     pub(crate) segmenter: Box<dyn Segmenter>,
     pub(crate) job: Job,
     pub(super) lost_views: Option<LostViews>,
-    /// The encoder of the generation that this encode replaces, if it is another.
+    /// Encoder of the replaced generation, if it is another.
     pub(super) encoder_before: Option<String>,
     pub(super) scene: Box<dyn LoadedScene + 'a>,
-    /// The views to use, as numbers in the order in which they are taken.
+    /// Indices of the views to use, in order.
     pub(crate) order: Vec<usize>,
     pub(super) coverage: Option<Coverage>,
     pub(super) coverage_secs: f64,
 }
 
 impl Plan<'_> {
-    /// Returns what every view needs on its way on this machine.
     pub(super) fn view_tools(&self) -> ViewTools<'_> {
         ViewTools {
             engines: self.engines,
@@ -77,7 +76,7 @@ pub(super) fn plan<'a>(
     let memory = memory_plan(settings, inputs, engines);
     memory.rest(0)?;
     if settings.output.text_model {
-        // What cannot be carried is refused before the work.
+        // Refused before any work.
         engines.models.text_side()?;
     }
     let segmenter = segmenter_of(&settings.view, &settings.run.gpus, engines, &inputs.standing)?;
@@ -125,10 +124,10 @@ impl Plan<'_> {
     }
 }
 
-/// Returns the encoder of the store's generation, where this encode publishes vectors of another: robots refuse
-/// them until they have its text model.
+/// Encoder of the store's generation, if this encode publishes another's vectors: robots refuse them until they have
+/// its text model.
 fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<String> {
-    // A store without a generation, or with a damaged one, has none to be told of.
+    // Without a generation, or with a damaged one, there is nothing to report.
     let reader = StoreReader::open(&settings.output.store).ok()?;
     let (before, now) = (&reader.manifest().encoder, engines.models.encoder_id());
     if before.id == Hash32(now.hash()) {
@@ -150,8 +149,7 @@ fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<St
     Some(before.name.clone())
 }
 
-/// Returns which kept views cannot be taken over, and says so; an encode that is unfinished is refused later, not
-/// replaced.
+/// Finds and reports kept views that cannot be reused; an unfinished encode is refused later, not replaced.
 fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, EncodeError> {
     let kept = job_status(store.db())?.filter(|status| status.n_views > 0 && status.is_published);
     let Some(JobStatus { n_views, .. }) = kept else { return Ok(None) };
@@ -166,8 +164,7 @@ fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, Enco
     Ok(Some(LostViews { n_views, reason }))
 }
 
-/// Reserves what is known of scene and settings; what depends on masks and contributions is reserved once the
-/// views are done.
+/// Reserves what is known of scene and settings; what depends on masks and contributions follows after the views.
 fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>) -> MemoryPlan {
     let n_gaussians = inputs.scene.len();
     let mut memory = MemoryPlan::new(settings.run.memory_bytes);
@@ -191,7 +188,7 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>
     memory
 }
 
-/// Opens the segmenter of some settings, on some GPUs; `standing`: what stands on the scene's ground.
+/// `standing`: things on the scene's ground.
 pub(crate) fn segmenter_of(
     settings: &ViewSettings,
     gpus: &[u32],
@@ -229,7 +226,7 @@ fn open_segmenter(
     })
 }
 
-/// Returns the views to use, as numbers in the order in which they are taken.
+/// Indices of the views to use, in order.
 fn choose_views(
     run: &RunSettings,
     scene: &dyn LoadedScene,
@@ -242,7 +239,7 @@ fn choose_views(
     let spread = |limit: usize| (0..limit).map(|i| i * n / limit).collect::<Vec<_>>();
     Ok(match run.view_order {
         ViewOrder::Names => ((0..limit).collect(), None),
-        // With a budget every beginning must be spread, with a limit the whole.
+        // With a time budget every prefix must be spread, with a limit the whole.
         ViewOrder::Nth if run.time_budget.is_some() => {
             let chosen = spread(limit);
             (coverage::spread_order(limit).into_iter().map(|i| chosen[i]).collect(), None)
@@ -270,8 +267,7 @@ mod tests {
     use slag_common::Gaussians;
     use slag_models::ModelDir;
 
-    /// Superpoints take more than 204 bytes a Gaussian, once all views are done: a budget below that is refused
-    /// before.
+    /// Superpoints take more than 204 bytes a Gaussian after the views; a smaller budget is refused beforehand.
     #[test]
     fn what_refinement_takes_is_refused_before_the_first_view() {
         let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);

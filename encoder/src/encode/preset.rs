@@ -24,7 +24,7 @@ pub enum Preset {
 }
 
 impl Preset {
-    /// Makes the choices of the preset in settings that have the defaults, which are those of [`Self::Balanced`].
+    /// Applies the preset to default settings, which are those of [`Self::Balanced`].
     pub fn apply(self, settings: &mut EncodeSettings) {
         let EncodeSettings { view, aggregation, cells, run, .. } = settings;
         match self {
@@ -53,7 +53,7 @@ impl Preset {
         }
     }
 
-    /// Returns how Segment Anything finds masks, where it does.
+    /// Settings of Segment Anything, for encodes that use it.
     pub fn sam(self) -> SamSettings {
         match self {
             Self::Paper => SamSettings::paper(),
@@ -78,7 +78,7 @@ mod tests {
     #[test]
     fn presets_are_what_they_are_called() {
         let [plain, fast, balanced] = [Preset::Plain, Preset::Fast, Preset::Balanced].map(settings);
-        // The same masks, so that only what is made of them differs.
+        // The same masks, so that only later steps differ.
         assert_eq!(
             (plain.aggregation, plain.cells.objects, plain.run.views_limit),
             (Aggregation::default(), false, ViewsLimit::All)

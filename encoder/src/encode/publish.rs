@@ -50,7 +50,7 @@ pub(super) fn publish(
     executor.begin_publication()?;
     plan.store.publish(&manifest, &built.extras)?;
     let mut summary = summary(&plan, &views, built, &manifest);
-    // With views left to do the contributions stay: the next encode goes on from them.
+    // With views left to do, contributions stay for the next encode.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
     let store = plan.store;
     if let Err(error) = tidy_up(plan, has_open, manifest.encoder.id) {
@@ -79,8 +79,7 @@ fn tidy_up(plan: Plan<'_>, has_open: bool, encoder: Hash32) -> Result<(), Encode
     Ok(())
 }
 
-/// Writes the text side of models into a store; what is there already is kept. Robots then fetch it with the
-/// scene.
+/// Copies the models' text side into the store, unless it is there; robots fetch it with the scene.
 fn carry_text_model(store: &Store, models: &ModelDir) -> Result<TextModelRecord, EncodeError> {
     let text_side = models.text_side()?;
     let mut files = Vec::new();
@@ -94,7 +93,7 @@ fn carry_text_model(store: &Store, models: &ModelDir) -> Result<TextModelRecord,
     Ok(TextModelRecord { description: ObjectRecord { hash, len_bytes }, files })
 }
 
-/// Warns where given masks may be of what to keep or to ignore, as trainers take them.
+/// Warns of given masks that look like a trainer's, which say what to keep or ignore.
 fn warn_of_single_masks(plan: &Plan<'_>, counts: &Counts, n_views: usize) {
     let is_given = matches!(plan.settings.view.masks, Masks::Given { .. });
     let n_with_masks = n_views - counts.n_views_without_masks;
@@ -112,7 +111,7 @@ fn manifest(
     text_model: Option<TextModelRecord>,
 ) -> Manifest {
     let (settings, inputs, models) = (plan.settings, plan.inputs, plan.engines.models);
-    // Robots take a score as an answer from three spreads above the mean on.
+    // Robots accept scores from three spreads above the mean on.
     let of_calibration = || {
         let Calibration { score_mean, score_spread } = built.calibration();
         (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)

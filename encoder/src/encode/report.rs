@@ -17,7 +17,7 @@ pub struct SkippedView {
     pub reason: String,
 }
 
-/// Views that are left out. The first ones are named as it happens, the others counted.
+/// Left-out views: the first ones are named as they occur, the others counted.
 #[derive(Default)]
 pub(crate) struct LeftOut(Vec<SkippedView>);
 
@@ -25,7 +25,7 @@ impl LeftOut {
     const N_NAMED: usize = 3;
 
     pub(crate) fn push(&mut self, view: String, mut reason: String) {
-        // Most errors name their view themselves.
+        // Most errors already name their view.
         if let Some(rest) = reason.strip_prefix(&format!("view {view}: ")) {
             reason = rest.to_owned();
         }
@@ -165,7 +165,7 @@ pub struct EncodeSummary {
 }
 
 impl EncodeSummary {
-    /// Returns whether every view was used, and most of the splat.
+    /// Whether every view was used, and most of the splat.
     pub(crate) fn is_whole(&self) -> bool {
         self.skipped_views.is_empty() && self.n_rejected <= self.n_gaussians
     }

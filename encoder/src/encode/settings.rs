@@ -18,13 +18,12 @@ use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
 use crate::viewpoints::ViewpointSettings;
 
-/// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and
-/// no better answers (generated scenes of seeds 601 to 605, and the labelled house).
+/// Scales of the built-in segmenter by default. A fourth gives a third more masks and no better answers (generated
+/// scenes of seeds 601 to 605, and the labelled house).
 pub const DEFAULT_MASK_LEVELS: usize = 3;
-/// Widest raster where the settings do not ask for more: masks are coarser than this, and time grows with the
-/// square.
+/// Widest raster by default: masks are coarser than this, and time grows with the square.
 pub(crate) const MAX_RASTER_WIDTH_PX: u32 = 1024;
-/// Gaussians of a cell at most: shards number them with 16 bits.
+/// Shards number a cell's Gaussians with 16 bits.
 pub(crate) const MAX_CELL_GAUSSIANS: usize = 65_536;
 pub(crate) const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 
@@ -97,7 +96,6 @@ impl Regions {
         *self == Self::Masks
     }
 
-    /// Returns whether masks are made. Objects need them.
     pub(crate) fn have_masks(self) -> bool {
         self != Self::Patches
     }
@@ -149,7 +147,6 @@ impl RasterWidth {
     }
 }
 
-/// How embeddings become shards.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellSettings {
     pub limits: CellLimits,
@@ -182,7 +179,6 @@ pub enum Restart {
     Never,
     /// Those of another splat or of other settings.
     IfOther,
-    /// All.
     Always,
 }
 
@@ -209,7 +205,6 @@ pub struct RunSettings {
     pub gpus: Vec<u32>,
 }
 
-/// How many views are used at most.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ViewsLimit {
     All,

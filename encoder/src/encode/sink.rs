@@ -16,24 +16,22 @@ pub(crate) struct ViewRecord {
     pub(crate) secs: f32,
 }
 
-/// Brings photos and mask files to this machine.
 pub(crate) trait PhotoSource: Sync {
     fn n_at_once(&self) -> usize;
 
-    /// Brings the files of a view to where the view says; returns whether the view is still to be done.
+    /// Fetches a view's files to its paths; returns whether the view is still to be done.
     fn fetch(&self, view: &View) -> Result<bool, EncodeError>;
 }
 
-/// Keeps what a view leaves.
 pub(crate) trait ViewSink: Sync {
     fn n_at_once(&self) -> usize;
 
-    /// Refuses a view whose photo or masks are others than planned; those that come by their hash cannot be.
+    /// Refuses a view whose photo or masks changed since planning; those fetched by hash cannot have.
     fn check_unchanged(&self, _view: &View, _segmenter: &dyn Segmenter) -> Result<(), EncodeError> {
         Ok(())
     }
 
-    /// Keeps a view's contributions and the outlines of its masks; on return they survive a power cut.
+    /// Keeps a view's contributions and outlines; they are durable on return.
     fn keep(
         &self,
         view: &View,

@@ -32,7 +32,6 @@ use crate::segment::{SegmentInput, Segmenter};
 
 const PICTURE_WIDTH_PX: u32 = 480;
 
-/// What every view needs on its way.
 #[derive(Clone, Copy)]
 pub(crate) struct ViewTools<'a> {
     pub(crate) engines: &'a Engines<'a>,
@@ -42,7 +41,7 @@ pub(crate) struct ViewTools<'a> {
     pub(crate) segmenter: &'a dyn Segmenter,
     pub(crate) scene: &'a dyn LoadedScene,
     pub(crate) split: &'a CellSplit,
-    /// Brings photos to this machine; `None` where they are.
+    /// Fetches photos; `None` if they are on this machine.
     pub(crate) photos: Option<&'a dyn PhotoSource>,
     pub(crate) sink: &'a dyn ViewSink,
 }
@@ -50,33 +49,29 @@ pub(crate) struct ViewTools<'a> {
 pub(crate) struct ViewStages<'a> {
     tools: ViewTools<'a>,
     context: &'a RunContext<'a>,
-    /// How crops become the image encoder's squares; `None` if it takes crops of any size.
+    /// How crops become the image encoder's squares; `None` if it takes any size.
     preprocess: Option<Preprocess>,
     encoders: Encoders,
-    /// The device that runs the image model, once it is open.
+    /// Device of the image model, once open.
     images_on: Arc<OnceLock<Option<String>>>,
     rotated: RotatedPhotos,
-    /// The most Gaussians of a view whose ellipses are beyond the numbers of the device.
+    /// Most Gaussians in a view whose ellipses overflow the device's numbers.
     n_unrepresentable: AtomicUsize,
 }
 
 enum Encoders {
-    /// One for each view at work, on the processor; those that are not at work. They are opened as they are
-    /// needed.
+    /// Idle encoders on the processor, one per view in work, opened as needed.
     OfViews(Mutex<Vec<Box<dyn ImageEncoder>>>),
-    /// On GPUs, for the crops of all views.
     Shared(SharedEncoders),
 }
 
-/// A view between two stages.
 pub(crate) struct Work<'v> {
     view: &'v View,
     next: Next,
-    /// Seconds of the stages so far.
+    /// Of the stages so far.
     secs: f32,
 }
 
-/// The next stage, with what it takes.
 enum Next {
     Fetch,
     Decode,
@@ -90,7 +85,7 @@ enum Next {
 
 struct Photo {
     loaded: LoadedImage,
-    /// Of the scene, camera z per pixel; absent where the segmenter does not want it.
+    /// Camera z of the scene per pixel; absent if the segmenter does not need it.
     depth: Option<Vec<f32>>,
 }
 
@@ -101,21 +96,21 @@ struct Segmented {
 
 struct Cropped {
     crops: Crops,
-    /// Windows that the last masks are, and what the others take of them.
+    /// Windows as the last masks, and their shares in the others.
     windows: Option<Surroundings>,
-    /// The photo, whose patches are embedded, too.
+    /// The photo, if its patches are embedded, too.
     patches: Option<(Arc<RgbImage>, PatchUse)>,
     partition: Partition,
 }
 
 enum Crops {
-    /// Squares of the model's size, for GPUs that take those of several views at once.
+    /// Squares of the model's size, for GPUs that batch several views.
     Squares(Vec<Crop>),
-    /// They are cut from the photo a batch at a time.
+    /// Masks, cut from the photo batch by batch.
     Uncut(Arc<RgbImage>, Vec<Mask>),
 }
 
-/// The regions of a view, the masks that cover each, and the outlines of masks.
+/// Regions of a view, the masks that cover each, and the masks' outlines.
 struct Partition {
     raster_view: RasterView,
     regions: RegionMap,
@@ -146,7 +141,7 @@ impl<'v> Work<'v> {
 }
 
 impl ViewTools<'_> {
-    /// Returns the stages, in the order in which [`ViewStages::step`] goes through them.
+    /// In the order of [`ViewStages::step`].
     pub(super) fn stages(&self) -> Vec<Stage> {
         let raster_slots = self.scene.gpus().map(GpuSlots::n_views);
         let on_cpu = |name| Stage { name, n_slots: self.n_threads, on_cpu: true };
@@ -171,7 +166,6 @@ impl ViewTools<'_> {
         stages
     }
 
-    /// Reserves the photos on their way, with masks and crops.
     pub(crate) fn reserve(&self, memory: &mut MemoryPlan, views: &[View]) {
         let Engines { models, session, .. } = self.engines;
         let preprocess = models.preprocess();
@@ -179,25 +173,24 @@ impl ViewTools<'_> {
         let wants_patches = self.settings.regions != Regions::Crops && models.patches_per_side().is_some();
         let stages = self.stages();
         let at = |name| stages.iter().position(|stage| stage.name == name).unwrap_or(0);
-        // Until their crops are cut, or embedded.
+        // Photos are held until their crops are cut, or embedded.
         let last = at(if on_gpus.is_none() || wants_patches { "embed" } else { "crop" });
         let n_under_way = pipeline::most_under_way(&stages, at("decode")..=last, self.n_threads);
         inputs::reserve_photos(memory, views, self.n_threads, n_under_way);
         let crops_bytes = |photo_px: u64| match on_gpus {
-            // One that is being cut.
+            // One crop being cut.
             Some(_) => 4 * photo_px,
             None => embed::batch_bytes(preprocess.as_ref(), photo_px),
         };
         inputs::reserve_crops(memory, views, self.n_threads, crops_bytes);
         if let Some(preprocess) = on_gpus {
-            // A byte a channel, and one for the mask.
+            // A byte per channel, and one for the mask.
             SharedEncoders::reserve(memory, self.gpus, 4 * u64::from(preprocess.size_px()).pow(2));
         }
     }
 }
 
 impl<'a> ViewStages<'a> {
-    /// Makes the stages; models are opened when the first view needs them.
     pub(crate) fn new(tools: ViewTools<'a>, context: &'a RunContext<'a>) -> Self {
         let (models, session) = (tools.engines.models.clone(), tools.engines.session.clone());
         let preprocess = models.preprocess();
@@ -236,7 +229,7 @@ impl<'a> ViewStages<'a> {
         }
     }
 
-    /// Returns the device that ran the image model, if it ran.
+    /// Device of the image model, if it ran.
     pub(crate) fn images_on(&self) -> Option<String> {
         self.images_on.get().cloned().flatten()
     }
@@ -254,7 +247,7 @@ impl<'a> ViewStages<'a> {
         }
     }
 
-    /// Does the work of the view's next stage; `None` after the last.
+    /// Does the view's next stage; `None` after the last.
     pub(super) fn step<'v>(&self, work: Work<'v>) -> Result<Option<Work<'v>>, EncodeError> {
         let (start, view) = (Instant::now(), work.view);
         let next = match work.next {
@@ -295,7 +288,7 @@ impl<'a> ViewStages<'a> {
             .context
             .install(draw)
             .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
-        // What shows through the scene's holes is nobody's depth.
+        // Holes of the scene have no depth.
         let seen = drawing.depth.iter().zip(&drawing.coverage);
         let seen: Vec<f32> = seen.map(|(depth, share)| if *share > 0.5 { *depth } else { 0.0 }).collect();
         let depth = enlarge(&seen, &raster_view, &loaded);
@@ -334,7 +327,7 @@ impl<'a> ViewStages<'a> {
         Ok(Cropped { crops, windows, patches, partition })
     }
 
-    /// Returns how the patches of a photo are used, and the regions that they are in place of masks.
+    /// How a photo's patches are used, and the regions they form in place of masks.
     fn patches(&self, photo: &RgbImage, masks: &[Mask]) -> (Option<PatchUse>, Option<Vec<Mask>>) {
         let Some(per_side) = self.tools.engines.models.patches_per_side() else { return (None, None) };
         let (width_px, height_px) = photo.dimensions();
@@ -351,7 +344,7 @@ impl<'a> ViewStages<'a> {
         }
     }
 
-    /// Returns the windows that masks take a share of: of a model that wants them, and has no patches.
+    /// Windows that masks take a share of, for a model that wants them and has no patches.
     fn windows(&self, photo: &RgbImage, masks: &[Mask]) -> Option<Windows> {
         let models = self.tools.engines.models;
         let has_patches = models.patches_per_side().is_some();
@@ -374,7 +367,6 @@ impl<'a> ViewStages<'a> {
         Partition { raster_view, regions, masks_of_region, outlines }
     }
 
-    /// Makes a vector per mask, or per patch that is a region.
     fn embed(&self, view: &View, cropped: Cropped) -> Result<Embedded, EncodeError> {
         let Cropped { crops, windows, patches, partition } = cropped;
         let failed = |source| EncodeError::Embed { view: view.name.clone(), source };
@@ -422,7 +414,6 @@ impl<'a> ViewStages<'a> {
         Ok(result)
     }
 
-    /// Rasterises what each Gaussian contributes to each region.
     fn lift(&self, view: &View, Embedded { vectors, partition }: Embedded) -> Result<Lifted, EncodeError> {
         let Partition { raster_view, regions, masks_of_region, outlines } = partition;
         let ViewTools { engines, scene, split, .. } = self.tools;
@@ -450,7 +441,7 @@ fn raster_view(loaded: &LoadedImage, width_px: u32) -> RasterView {
     RasterView { intrinsics, ..RasterView::of(&loaded.view) }
 }
 
-/// Returns a raster's values at the photo's size, nearest.
+/// Enlarges a raster's values to the photo's size, nearest neighbour.
 fn enlarge(values: &[f32], raster_view: &RasterView, loaded: &LoadedImage) -> Vec<f32> {
     let (width, height) = (u64::from(loaded.image.width()), u64::from(loaded.image.height()));
     let (from_width, from_height) =

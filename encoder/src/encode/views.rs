@@ -20,25 +20,24 @@ use crate::memory::Phase;
 use crate::occupancy::{self, OccupancyError, SceneOccupancy};
 use crate::shard;
 
-/// The views of a run, done or left out.
 pub(super) struct DoneViews<'a> {
-    /// The views whose contributions are used, in the order of their names.
+    /// Views whose contributions are used, by name.
     pub(super) used: Vec<&'a View>,
-    /// The records of all views that are done, by name.
+    /// Records of all finished views, by name.
     pub(super) records: BTreeMap<String, ViewRecord>,
-    /// Views left out for a missing photo or an error, in the order of their names.
+    /// Left out for a missing photo or an error, by name.
     pub(super) skipped: Vec<SkippedView>,
-    /// Views left out for an error in this run.
+    /// Left out for an error in this run.
     pub(super) n_failed: usize,
     pub(super) n_resumed: usize,
     pub(super) coverage: Option<CoverageReport>,
     pub(super) stages: Vec<StageReport>,
     pub(super) secs: f64,
-    /// The device that ran the image model, if it ran.
+    /// Device of the image model, if it ran.
     pub(super) images_on: Option<String>,
 }
 
-/// Takes the views that are not done yet through their stages.
+/// Takes the unfinished views through their stages.
 ///
 /// # Errors
 /// [`EncodeError`]; finished views stay finished.
@@ -61,7 +60,7 @@ pub(super) fn run_views<'a>(
     let n_failed = failed.len();
     let mut skipped = [&plan.inputs.missing[..], &failed[..]].concat();
     skipped.sort_by(|a, b| a.view.cmp(&b.view));
-    // In the order of names, whatever the order of the work.
+    // Ordered by name, not by completion.
     let records = plan.job.done_views()?;
     let is_done = |view: &usize| records.contains_key(&views[*view].name);
     let mut used: Vec<usize> = plan.order.iter().copied().filter(is_done).collect();
@@ -74,7 +73,7 @@ pub(super) fn run_views<'a>(
     Ok(DoneViews { used, records, skipped, n_failed, n_resumed, coverage, stages, secs, images_on })
 }
 
-/// Finds the free and occupied places that the used views show; `None` if the settings do not ask for them.
+/// Finds free and occupied places from the used views; `None` if the settings do not ask for them.
 pub(super) fn look_around(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
@@ -98,7 +97,7 @@ pub(super) fn look_around(
     Ok(Some(found))
 }
 
-/// Finds the landmarks of each cell in the photos of the used views; `None` if the settings do not ask for them.
+/// Finds each cell's landmarks in the used photos; `None` if the settings do not ask for them.
 pub(super) fn find_landmarks(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,

@@ -19,22 +19,19 @@ use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, RunContext, ViewRecord, ViewsRun};
 use crate::encode::{EncodeError, Engines, SkippedView};
 
-/// The executor of an encode whose views are done by workers.
 pub(crate) struct Coordinator {
     bucket: Arc<Bucket>,
-    /// Where work is handed out; without it, workers have shares.
+    /// Hands out work; without it, workers have shares.
     queue: Option<QueueSettings>,
-    /// The run, once it has begun, until it is published.
+    /// From the run's beginning to its publication.
     run: Mutex<Option<(Run, Heartbeat)>>,
 }
 
 impl Coordinator {
-    /// `queue`: where work is handed out; without it, workers have shares.
     pub(crate) fn new(bucket: Arc<Bucket>, queue: Option<QueueSettings>) -> Self {
         Self { bucket, queue, run: Mutex::default() }
     }
 
-    /// Uploads what the open views need, and begins a run of them.
     fn begin(
         &self,
         plan: &Plan<'_>,
@@ -94,18 +91,18 @@ impl Executor for Coordinator {
     }
 }
 
-/// The views of a run that are not on this machine.
+/// Views of a run that are not on this machine yet.
 struct ViewsInWork<'a> {
     bucket: &'a Bucket,
     run: Run,
     queue: Option<Enqueuer>,
-    /// Number in the plan and name, by identity.
+    /// By identity: index in the plan, and name.
     open: BTreeMap<Hash32, (usize, String)>,
     skipped: LeftOut,
 }
 
 impl ViewsInWork<'_> {
-    /// Brings the views that are in the bucket into the job of this machine; returns how many these are.
+    /// Downloads finished views into this machine's job; returns their number.
     fn fetch_done(&mut self, plan: &Plan<'_>, context: &RunContext<'_>) -> Result<usize, FleetError> {
         let names = self.bucket.list("views")?;
         let there: BTreeSet<Hash32> = names.iter().filter_map(|name| name.parse().ok()).collect();
@@ -131,7 +128,7 @@ impl ViewsInWork<'_> {
         Ok(plan.job.mark_done(name, view.record)?)
     }
 
-    /// Leaves out the views that workers could not do; with `is_strict`, fails at the first one.
+    /// Leaves out views that workers could not do; with `is_strict`, fails at the first.
     fn take_failed(&mut self, is_strict: bool) -> Result<(), FleetError> {
         for name in self.bucket.list(&self.run.failed_folder())? {
             let number: Option<usize> = name.strip_suffix(".json").and_then(|number| number.parse().ok());
@@ -160,7 +157,7 @@ impl ViewsInWork<'_> {
         Ok(())
     }
 
-    /// Lets the workers go; returns the views that are left out.
+    /// Dismisses the workers; returns the left-out views.
     fn end(self) -> Result<Vec<SkippedView>, FleetError> {
         self.run.views_are_done(self.bucket)?;
         if let Some(queue) = &self.queue {

@@ -7,24 +7,24 @@ use std::time::{Duration, Instant};
 
 use super::error::FleetError;
 
-/// Returns the numbers of the views that are not done, in the order in which they should be begun.
+/// Returns the open views' indices, in the order in which to begin them.
 pub(super) type OpenViews<'a> = &'a mut dyn FnMut() -> Result<Vec<usize>, FleetError>;
 
-/// Gives a worker its views, by their numbers in the plan.
+/// Gives a worker its views, by index in the plan.
 pub(super) trait Dispatcher: Sync {
-    /// Called before views are taken, and again where [`Dispatcher::wait`] says so.
+    /// Called before views are taken, and again after [`Dispatcher::wait`].
     fn offer(&self, open: OpenViews<'_>) -> Result<(), FleetError>;
 
-    /// Returns the next view, without waiting; `None` if there is none at present.
+    /// The next view, without waiting; `None` if there is none at present.
     fn take(&self) -> Option<usize>;
 
-    /// Says that the view's contributions, or its failure, are in the bucket.
+    /// The view's contributions, or its failure, are in the bucket.
     fn done(&self, view: usize);
 
-    /// Waits at most `pause` for a view; returns whether there may be one.
+    /// Waits at most `pause`; returns whether there may be a view.
     fn wait(&self, pause: Duration) -> bool;
 
-    /// Returns the views that were given to workers too often, each time without a result.
+    /// Views that were handed out too often without a result.
     fn take_dead(&self) -> Vec<usize> {
         Vec::new()
     }
@@ -39,9 +39,9 @@ pub(super) struct Share {
 
 struct Progress {
     todo: VecDeque<usize>,
-    /// When the own share was done, or help was last given.
+    /// End of the own share, or of the last help.
     idle_since: Instant,
-    /// Whether the next offer is of others' shares.
+    /// Whether the next offer includes others' shares.
     helps: bool,
 }
 
@@ -62,7 +62,7 @@ impl Dispatcher for Share {
         let mut progress = self.progress();
         let is_chosen = |view: &usize| progress.helps || view % self.of == self.index;
         let mut chosen: VecDeque<usize> = open.into_iter().filter(is_chosen).collect();
-        // Helpers begin at different places, so that few of them do the same.
+        // Helpers begin at different places, to do few views twice.
         if progress.helps && !chosen.is_empty() {
             let at = self.index * chosen.len() / self.of;
             chosen.rotate_left(at);
@@ -94,7 +94,7 @@ impl Dispatcher for Share {
 mod tests {
     use super::*;
 
-    /// By hand: worker 1 of 3 of 7 views; then it helps with what is left.
+    /// By hand: worker 1 of 3 of 7 views, which then helps.
     #[test]
     fn a_worker_does_its_share_and_then_what_others_left() {
         let share = Share::new(1, 3, Duration::ZERO);

@@ -12,12 +12,11 @@ use crate::encode::ViewSettings;
 
 const FORMAT: u32 = 4;
 
-/// Returns the version of this program, as documents state it.
 pub(super) fn own_version() -> String {
     format!("{}, fleet format {FORMAT}", env!("CARGO_PKG_VERSION"))
 }
 
-/// The first thing read of a plan: the rest may have another form in another version.
+/// Read first: the rest of a plan may differ between versions.
 #[derive(Deserialize)]
 pub(super) struct PlannedBy {
     pub(super) program: String,

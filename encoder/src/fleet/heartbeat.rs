@@ -11,7 +11,7 @@ use super::error::FleetError;
 use super::run::Run;
 use crate::blobs::Bucket;
 
-/// Time between two beats, and between two looks at them.
+/// Interval of beats, and of checks for them.
 const BEAT: Duration = Duration::from_secs(10);
 
 pub(super) struct Heartbeat {
@@ -39,9 +39,9 @@ impl Heartbeat {
 
 pub(super) struct HeartbeatWatch {
     run: Run,
-    /// Time without a new beat after which the coordinator counts as gone.
+    /// The coordinator counts as gone after this long without a new beat.
     patience: Duration,
-    /// The last beat, since when it is known, and the last look.
+    /// The last beat, when it was first seen, and the last check.
     last: Option<Vec<u8>>,
     since: Instant,
     looked: Option<Instant>,
@@ -52,7 +52,7 @@ impl HeartbeatWatch {
         Self { run, patience, last: None, since: Instant::now(), looked: None }
     }
 
-    /// Looks for a new beat, if it is time to.
+    /// Checks for a new beat, if it is time.
     ///
     /// # Errors
     /// [`FleetError::Abandoned`]; [`FleetError::Blob`].
@@ -62,7 +62,7 @@ impl HeartbeatWatch {
         }
         let beat = bucket.get(&self.run.heartbeat_key())?.map(|bytes| bytes.to_vec());
         let now = Instant::now();
-        // What happened while this worker was busy, or stood still, is no silence.
+        // Time in which this worker was busy or suspended is no silence.
         if beat != self.last || self.looked.is_none() {
             (self.last, self.since) = (beat, now);
         }
@@ -80,7 +80,7 @@ impl HeartbeatWatch {
 mod tests {
     use super::*;
 
-    /// A worker that has waited accepts a new beat, and gives up at the same one.
+    /// After a wait, a new beat is accepted; the same one is given up on.
     #[test]
     fn silence_is_noticed() {
         let dir = tempfile::tempdir().expect("a folder");

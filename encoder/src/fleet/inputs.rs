@@ -17,7 +17,7 @@ use crate::encode::fleet_parts::{Plan, RunContext, ViewSink};
 use crate::ingest;
 use crate::segment;
 
-/// Uploads the scene and the files of the views to do, and returns the plan of a run. `open`: their numbers.
+/// Uploads the scene and the open views' files; returns the plan of a run. `open`: indices of views.
 pub(super) fn upload(
     bucket: &Bucket,
     plan: &Plan<'_>,
@@ -48,7 +48,7 @@ pub(super) fn upload(
         let view = &plan.inputs.views[*number];
         let masks = mask_folder.and_then(|dir| segment::mask_file(dir, view));
         let masks = masks.map(|path| put(&path)).transpose()?;
-        // Large photos cost most; of photos of one size those with the larger files of masks.
+        // Large photos cost most; at equal size, those with larger mask files.
         let cost = ingest::photo_area_px(view) + masks.as_ref().map_or(0, |(_, len)| *len);
         let planned = PlannedView {
             name: view.name.clone(),
@@ -66,7 +66,7 @@ pub(super) fn upload(
     views.sort_by_key(|(cost, _)| std::cmp::Reverse(*cost));
     Ok(RunPlan {
         program: documents::own_version(),
-        // The standard library's random hash keys are new for each call.
+        // The standard library's hash keys are random for each call.
         coordinator: RandomState::new().build_hasher().finish(),
         engines: engines_text(plan.engines.models.encoder_id(), &plan.segmenter.identity()),
         of_scene: plan.job.of_scene(),
@@ -107,7 +107,6 @@ impl ViewFiles {
         Some(self.mask_folder().join(format!("{}.{}", view.name, file.ending)))
     }
 
-    /// Returns the views as the pipeline takes them.
     pub(super) fn views(&self) -> Result<Vec<View>, FleetError> {
         let view = |planned: &PlannedView| {
             let is_inside = |path: &Path| path.components().all(|part| matches!(part, Component::Normal(_)));
@@ -134,12 +133,11 @@ impl ViewFiles {
     pub(super) fn remove(&self, view: &View) {
         let Some(planned) = self.planned(view) else { return };
         for path in std::iter::once(self.photo_path(planned)).chain(self.mask_path(planned)) {
-            // It may never have been fetched; the folder goes with the worker anyway.
+            // It may never have been fetched, and the folder goes with the worker anyway.
             let _ = std::fs::remove_file(path);
         }
     }
 
-    /// Brings the photo and masks of a view to where the view says.
     pub(super) fn fetch(&self, view: &View) -> Result<(), FleetError> {
         let Some(planned) = self.planned(view) else { return Ok(()) };
         let mut files = vec![(&planned.photo, self.photo_path(planned))];
@@ -153,7 +151,6 @@ impl ViewFiles {
     }
 }
 
-/// Brings an input from the bucket and checks its content.
 pub(super) fn fetch_input(bucket: &Bucket, hash: Hash32) -> Result<axum::body::Bytes, FleetError> {
     let key = documents::input_key(hash);
     let bytes = bucket.require(&key)?;

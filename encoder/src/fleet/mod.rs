@@ -12,8 +12,8 @@
 //! | `jobs/N/end.json` | how run N ended: published, or superseded by the next. The first one to put it decides |
 //! | `views/IDENTITY` | a view's contributions: it is done when this is there |
 //!
-//! Inputs and views are named by what they are made of, and put on condition that they are not there: work that is
-//! done twice, by a worker that was thought dead, changes nothing, and a run takes up what earlier ones left.
+//! Inputs and views are named by content and put only if absent: work that is done twice, by a worker that was thought
+//! dead, changes nothing, and a run reuses the results of earlier ones.
 
 pub(crate) mod coordinator;
 mod dispatch;

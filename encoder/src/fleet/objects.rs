@@ -12,7 +12,7 @@ const VIEW_MAGIC: [u8; 8] = *b"SLAGVIEW";
 const SCENE_MAGIC: [u8; 8] = *b"SLAGSCEN";
 const VERSION: u32 = 1;
 
-/// Returns the object of a view: its record (JSON), the outlines of its masks, and the file of its contributions.
+/// A view's object: its record (JSON), the masks' outlines, and the file of contributions.
 pub(super) fn pack_view(
     record: ViewRecord,
     outlines: &[u8],
@@ -54,7 +54,7 @@ impl ViewObject {
     }
 }
 
-/// Returns the object of a scene. Coefficients of higher degree are left out: an encode does not read them.
+/// Leaves out coefficients of higher degree, which an encode does not read.
 pub(super) fn pack_scene(scene: &Gaussians) -> std::io::Result<Vec<u8>> {
     let n = scene.len() as u64;
     let sections = [

@@ -27,14 +27,14 @@ pub(super) struct Prepared {
     pub(super) scene: Gaussians,
     pub(super) split: CellSplit,
     pub(super) standing: Arc<Standing>,
-    /// The views, by their numbers in the plan.
+    /// By index in the plan.
     pub(super) views: Vec<View>,
     pub(super) number_of: HashMap<String, usize>,
     pub(super) files: ViewFiles,
 }
 
 impl Prepared {
-    /// Brings scene and masks to `folder`. `segmenter`: this machine's mask model.
+    /// Fetches scene and masks to `folder`. `segmenter`: this machine's mask model.
     pub(super) fn fetch(
         bucket: &Arc<Bucket>,
         (run, plan): (Run, RunPlan),
@@ -73,7 +73,7 @@ impl Prepared {
         Ok(Self { run, plan, settings, scene, split, standing, views, number_of, files })
     }
 
-    /// Refuses to work where the contributions would be others than the coordinator expects.
+    /// Fails if the contributions would differ from the coordinator's.
     pub(super) fn check(
         &self,
         engines: &Engines<'_>,
@@ -92,7 +92,6 @@ impl Prepared {
         }
     }
 
-    /// Checks that what the worker holds for scene and views fits into its memory.
     pub(super) fn check_memory(&self, memory_bytes: u64, tools: &ViewTools<'_>) -> Result<(), FleetError> {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());

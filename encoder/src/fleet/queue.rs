@@ -1,8 +1,8 @@
 //! A run's queue on NATS JetStream: a stream with work-queue retention for each run, and one durable pull consumer
 //! that all workers share. It only hands out work: the coordinator fills it again from what the bucket lacks.
 //!
-//! A worker holds few messages at a time, says that it is at work on each of them every third of the time after
-//! which the server would hand it to another, and acknowledges a message once its result is in the bucket.
+//! A worker holds few messages at a time, reports progress on each every third of the ack wait, and acknowledges a
+//! message once its result is in the bucket.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt::Display;
@@ -23,11 +23,11 @@ use super::error::FleetError;
 use super::run::Run;
 
 const CONSUMER: &str = "workers";
-/// Time that a request for work waits at the server.
+/// How long a pull request waits at the server.
 const PULL_WAIT: Duration = Duration::from_secs(1);
-/// Pause before a request that failed is made again: the server may be down, or its stream not made yet.
+/// Pause before a retry: the server may be down, or its stream not made yet.
 const RETRY_PAUSE: Duration = Duration::from_millis(300);
-/// Time between two looks of the coordinator at the stream.
+/// Interval of the coordinator's checks of the stream.
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Where work is handed out, and how patiently.
@@ -78,12 +78,12 @@ pub(super) struct Enqueuer {
     stream: String,
     last_look: Option<Instant>,
     is_filled: bool,
-    /// Whether the last look found an empty queue although views were open.
+    /// The last check found an empty queue with open views.
     was_empty: bool,
 }
 
 impl Enqueuer {
-    /// Connects; the stream is made when it is filled.
+    /// Connects; the stream is made when first filled.
     pub(super) fn open(
         runtime: &Arc<Runtime>,
         settings: &QueueSettings,
@@ -102,10 +102,8 @@ impl Enqueuer {
         })
     }
 
-    /// Fills the queue with the views that are not done where the stream is gone, was never filled, or has lost
-    /// them.
-    ///
-    /// A server that refuses or does not answer is asked again later.
+    /// Fills the queue with open views if the stream is gone, was never filled, or has lost them. A server that refuses
+    /// or does not answer is retried later.
     pub(super) fn keep_filled(&mut self, open: &[usize]) {
         let is_due = self.last_look.is_none_or(|last| last.elapsed() >= LOOK_INTERVAL);
         if !is_due || open.is_empty() {
@@ -122,7 +120,7 @@ impl Enqueuer {
         if self.is_filled {
             match self.n_left().await {
                 Some(0) if self.was_empty => tracing::warn!("the queue has lost {} views", open.len()),
-                // A worker may have taken the last one to the bucket since the bucket was listed.
+                // A worker may have stored the last one since the bucket was listed.
                 Some(0) => {
                     self.was_empty = true;
                     return Ok(());
@@ -139,7 +137,7 @@ impl Enqueuer {
         Ok(())
     }
 
-    /// Returns the number of views that are waiting or at work; `None` if there is no queue.
+    /// Number of views waiting or in work; `None` without a queue.
     async fn n_left(&self) -> Option<u64> {
         let stream = self.context.get_stream(&self.stream).await.ok()?;
         let mut consumer: PullConsumer = stream.get_consumer(CONSUMER).await.ok()?;
@@ -155,7 +153,7 @@ impl Enqueuer {
             ..stream::Config::default()
         };
         let stream = self.context.get_or_create_stream(config).await.map_err(|e| e.to_string())?;
-        // Workers give a view up, so that its end is recorded in the bucket.
+        // Workers, not the server, give a view up, so that the failure is recorded in the bucket.
         let consumer = pull::Config {
             durable_name: Some(CONSUMER.into()),
             ack_policy: AckPolicy::Explicit,
@@ -177,7 +175,7 @@ impl Enqueuer {
         Ok(())
     }
 
-    /// Removes the queue of a run whose views are done; one that stays does no harm.
+    /// Removes a finished run's queue; one that stays does no harm.
     pub(super) fn close(&self) {
         if let Err(error) = self.runtime.block_on(self.context.delete_stream(&self.stream)) {
             tracing::warn!("{}: {error}", self.stream);
@@ -219,7 +217,7 @@ impl Held {
         let is_new = messages.of_view.insert(view, Arc::new(message)).is_none();
         match is_dead {
             true => messages.dead.push(view),
-            // A view that comes again while it is at work here is the same work.
+            // A view that is redelivered while in work here is the same work.
             false if is_new => messages.waiting.push_back(view),
             false => {}
         }
@@ -229,7 +227,7 @@ impl Held {
 }
 
 impl Queue {
-    /// Connects, and asks for at most `n_most` views at a time from then on, until it is dropped.
+    /// Connects, and pulls at most `n_most` views at a time until dropped.
     pub(super) fn open(
         runtime: &Arc<Runtime>,
         settings: &QueueSettings,
@@ -252,7 +250,6 @@ impl Queue {
     }
 }
 
-/// Asks for work for as long as the worker holds fewer views than it may.
 async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliver: i64) {
     let mut consumer: Option<PullConsumer> = None;
     loop {
@@ -267,7 +264,7 @@ async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliv
             continue;
         }
         let Some(open) = consumer.take() else {
-            // The stream is made by the coordinator, perhaps anew.
+            // The coordinator makes the stream, perhaps anew.
             match context.get_consumer_from_stream(CONSUMER, &stream).await {
                 Ok(found) => consumer = Some(found),
                 Err(_) => tokio::time::sleep(RETRY_PAUSE).await,
@@ -293,14 +290,13 @@ async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliv
     }
 }
 
-/// Tells the server that the worker is at work on what it holds.
 async fn send_heartbeats(held: Weak<Held>, interval: Duration) {
     loop {
         tokio::time::sleep(interval).await;
         let Some(held) = held.upgrade() else { return };
         let messages: Vec<Arc<Message>> = held.messages().of_view.values().cloned().collect();
         for message in messages {
-            // One that is lost is redelivered, and its work done twice.
+            // A lost one causes redelivery, and the work is done twice.
             let _ = message.ack_with(AckKind::Progress).await;
         }
     }
@@ -318,7 +314,7 @@ impl Dispatcher for Queue {
     fn done(&self, view: usize) {
         let Some(message) = self.held.messages().of_view.remove(&view) else { return };
         self.held.runtime.spawn(async move {
-            // Where it is lost, the view comes again and is found done.
+            // If it is lost, the view is redelivered and found done.
             let _ = message.double_ack().await;
         });
     }

@@ -6,7 +6,7 @@ use super::documents::{self, End, PlannedBy, RunPlan};
 use super::error::FleetError;
 use crate::blobs::Bucket;
 
-/// Objects of a run: how it ended; all its views are done.
+/// Keys of a run: how it ended; all its views are done.
 const END: &str = "end.json";
 const DONE: &str = "done";
 
@@ -34,7 +34,7 @@ impl Run {
         self.key("heartbeat")
     }
 
-    /// Returns the newest run, and the names of all objects of runs.
+    /// The newest run, and the names of all runs' objects.
     fn newest(bucket: &Bucket) -> Result<Option<(Self, Vec<String>)>, FleetError> {
         let names = bucket.list("jobs")?;
         let number = |name: &String| name.strip_suffix("/plan.json")?.parse().ok();
@@ -63,7 +63,7 @@ impl Run {
         }
     }
 
-    /// Returns the newest run and its plan, unless its views are done or it has ended.
+    /// The newest run and its plan, unless it has ended or its views are done.
     pub(super) fn open(bucket: &Bucket) -> Result<Option<(Self, RunPlan)>, FleetError> {
         let Some((run, names)) = Self::newest(bucket)? else { return Ok(None) };
         if [DONE, END].iter().any(|name| run.has(&names, name)) {
@@ -91,12 +91,12 @@ impl Run {
         Ok(bucket.len_of(&self.key(END))?.is_some())
     }
 
-    /// Lets workers go: all views are in the bucket, or have failed.
+    /// Dismisses the workers: all views are in the bucket, or have failed.
     pub(super) fn views_are_done(self, bucket: &Bucket) -> Result<(), FleetError> {
         Ok(bucket.put(&self.key(DONE), "")?)
     }
 
-    /// Returns whether another coordinator has taken the run's place: its own run follows at once.
+    /// Whether another coordinator has superseded the run; its own run follows at once.
     ///
     /// # Errors
     /// [`FleetError::Blob`]; a document that is none.
@@ -106,7 +106,6 @@ impl Run {
         Ok(documents::parse::<End>(bucket, &key, &bytes)? == End::Superseded)
     }
 
-    /// Fails if another coordinator has taken the run's place.
     pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
         match self.has_ended(bucket)? {
             true => Err(self.superseded(bucket)),
@@ -114,7 +113,6 @@ impl Run {
         }
     }
 
-    /// Ends the run by its publication.
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
         // Only the run's own coordinator puts this.
         match bucket.claim(&self.key(END), documents::to_bytes(&End::Published)?)? {

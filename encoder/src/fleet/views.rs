@@ -19,8 +19,7 @@ use crate::lift::photos::{MaskOutline, outlines_to_bytes};
 use crate::raster::LoadedScene;
 use crate::segment::Segmenter;
 
-/// Views whose photos are fetched at once, and views whose objects are put: one while another is decoded or
-/// packed.
+/// Concurrent fetches of photos, and puts of results: one while another is decoded or packed.
 const N_AT_ONCE: usize = 2;
 
 pub(super) struct ViewWork<'a> {
@@ -32,7 +31,6 @@ pub(super) struct ViewWork<'a> {
     pub(super) dispatcher: &'a dyn Dispatcher,
     pub(super) n_threads: usize,
     pub(super) gpus: &'a [u32],
-    /// Views whose objects this worker put.
     pub(super) n_done: AtomicUsize,
 }
 
@@ -51,7 +49,7 @@ impl ViewWork<'_> {
         }
     }
 
-    /// Does the views that there are; ends when no more are to be had at present.
+    /// Does the available views; ends when there are none at present.
     pub(super) fn run(&self, context: &RunContext<'_>) -> Result<(), FleetError> {
         let prepared = self.prepared;
         let stages = ViewStages::new(self.tools(), context);
@@ -112,7 +110,7 @@ impl ViewSink for ViewWork<'_> {
         let contributions = contributions.to_bytes(&view.image_path)?;
         let bytes = objects::pack_view(record, &outlines_to_bytes(outlines)?, &contributions)?;
         let id = self.prepared.plan.views[self.prepared.number_of[&view.name]].id;
-        // Where another worker was first, its object has the same content.
+        // If another worker was first, its object has the same content.
         if self.bucket.put_new(&documents::view_key(id), bytes)? {
             self.n_done.fetch_add(1, Ordering::Relaxed);
         }
@@ -121,8 +119,7 @@ impl ViewSink for ViewWork<'_> {
     }
 }
 
-/// Yields the views that are to be had at present. Nothing here waits for the bucket: whether another worker did a
-/// view meanwhile is found where its photo is fetched.
+/// Yields the available views without waiting for the bucket: the fetch of the photo finds views done meanwhile.
 fn views_to_do<'a>(
     dispatcher: &'a dyn Dispatcher,
     views: &'a [View],
@@ -133,7 +130,7 @@ fn views_to_do<'a>(
             let number = dispatcher.take()?;
             match views.get(number) {
                 Some(view) => return Some(view),
-                // Of a message that this program did not write.
+                // A message that this program did not write.
                 None => dispatcher.done(number),
             }
         }

@@ -22,7 +22,7 @@ use crate::encode::fleet_parts::{RunContext, segmenter_of};
 use crate::encode::{EncodeError, Engines};
 use crate::progress::Progress;
 
-/// Pause between two looks at the state of a run: in a folder, and over a network.
+/// Pause between checks of a run's state: in a folder, and over a network.
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(1)];
 
 #[derive(Clone, Debug)]
@@ -45,11 +45,10 @@ pub(crate) struct WorkerSettings {
     pub(crate) n_threads: usize,
     pub(crate) gpus: Vec<u32>,
     pub(crate) memory_bytes: u64,
-    /// Folder for photos in work; it need not outlast the worker.
+    /// Folder for photos in work; temporary.
     pub(crate) folder: PathBuf,
-    /// The mask model, where the coordinator uses one.
     pub(crate) segmenter: Option<PathBuf>,
-    /// Time to wait for a run to begin, and for a heartbeat of its coordinator.
+    /// How long to wait for a run, and for a heartbeat of its coordinator.
     pub(crate) patience: Duration,
 }
 
@@ -134,7 +133,6 @@ fn work_for(
     result
 }
 
-/// Does views for as long as the run has any to do.
 fn while_open(
     work: &ViewWork<'_>,
     mut coordinator: HeartbeatWatch,
@@ -157,7 +155,7 @@ fn while_open(
     }
 }
 
-/// Returns the views of a run that are neither done nor given up, costly ones first.
+/// Views that are neither done nor given up, costly ones first.
 fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<usize>, FleetError> {
     let done: BTreeSet<String> = bucket.list("views")?.into_iter().collect();
     let failed = bucket.list(&prepared.run.failed_folder())?;
@@ -169,7 +167,7 @@ fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<usize>, FleetE
     Ok(open.map(|(number, _)| number).collect())
 }
 
-/// Records the views that ended several workers, so that the run goes on without them.
+/// Records views that ended several workers, so that the run goes on without them.
 fn record_failures(bucket: &Bucket, run: Run, dispatcher: &dyn Dispatcher) -> Result<(), FleetError> {
     for view in dispatcher.take_dead() {
         let reason = "it was given to workers several times, and none left a result; their logs say why";
@@ -180,11 +178,11 @@ fn record_failures(bucket: &Bucket, run: Run, dispatcher: &dyn Dispatcher) -> Re
     Ok(())
 }
 
-/// Names of folders begin so. The process's number follows, which says little: workers of other machines and
+/// Prefix of folder names, before the process's number, which is not unique: workers on other machines and in
 /// containers may share the parent.
 const PREFIX: &str = "slag-worker-";
 
-/// The file in each folder that its worker holds locked.
+/// File in each folder that its worker keeps locked.
 const LOCK: &str = "lock";
 
 pub(super) struct RunFolder {
@@ -193,12 +191,12 @@ pub(super) struct RunFolder {
 }
 
 impl RunFolder {
-    /// Makes a folder under `parent`, and removes those that killed workers left there.
+    /// Makes a folder under `parent`, and removes those of killed workers.
     pub(super) fn make(parent: &Path) -> Result<Self, FleetError> {
         fs_err::create_dir_all(parent)?;
         remove_left(parent);
         let name = format!("{PREFIX}{}-", std::process::id());
-        // Hidden until it is locked: another worker that begins now would take it for a left one.
+        // Hidden until locked, or a worker that starts now would take it for a leftover.
         let hidden = tempfile::Builder::new().prefix(&format!(".{name}")).tempdir_in(parent)?;
         let lock = File::create_new(hidden.path().join(LOCK))?;
         lock.lock()?;
@@ -221,7 +219,7 @@ impl Drop for RunFolder {
     }
 }
 
-/// Removes the folders whose workers are gone. What cannot be looked at is left alone.
+/// Removes folders whose workers are gone, except those that cannot be read.
 fn remove_left(parent: &Path) {
     let Ok(entries) = fs_err::read_dir(parent) else { return };
     for entry in entries.flatten() {

@@ -8,19 +8,19 @@ use slag_math::stats::{median, trimmed_range};
 /// Side of a tile, in resolutions of the splat: 2.5 m in a survey from 40 m.
 const TILE: f64 = 36.0;
 const MAX_TILES: f64 = 512.0;
-/// Height of a level, in which surfaces are added up, resolutions.
+/// Height of a level, over which surface is summed, resolutions.
 const LEVEL: f64 = 1.5;
-/// A tile's ground is the level with most surface; or one that far below it with at least this share of that: a floor
-/// below its ceiling. Gaussians that fill the ground lie closer below it.
+/// A tile's ground is the level with most surface, or one at least this far below it with at least this share of that:
+/// a floor below its ceiling. Gaussians that fill the ground lie closer below it.
 const BELOW_LEVELS: i64 = 20;
 const BELOW_SHARE: f64 = 0.4;
-/// Levels on each side whose mean the ground is: a slope fills several.
+/// Levels on each side that the ground is averaged over: a slope fills several.
 const NEAR: i64 = 2;
-/// Tiles on each side that the ground of a tile is known by: roofs and gaps are fewer than half of 9 x 9.
+/// Tiles on each side that determine a tile's ground: roofs and gaps are fewer than half of 9 x 9.
 const AROUND: usize = 4;
-/// The first time a slope fills several levels of a tile, the second time it is flat.
+/// A slope fills several levels of a tile in the first round, and is flat in the second.
 const ROUNDS: usize = 2;
-/// Share of the Gaussians beyond the tiles at each end.
+/// Share of the Gaussians left out of the tiles at each end.
 const TRIMMED: f64 = 0.005;
 
 #[derive(Debug)]
@@ -30,12 +30,11 @@ pub(super) struct Ground {
     n: [usize; 2],
     /// `[n[1]][n[0]]`; NaN where nothing is near.
     heights: Vec<f64>,
-    /// The longer side of the ground.
     pub(super) width: f64,
 }
 
 impl Ground {
-    /// Finds the ground under points, z up, each with the area of its surface. `None` without any.
+    /// Finds the ground below points (z up), each with its area of surface. `None` without points.
     pub(super) fn find(points: &[(DVec3, f64)], resolution: f64) -> Option<Self> {
         let range = |axis: usize| {
             let mut along: Vec<f64> = points.iter().map(|(point, _)| point[axis]).collect();
@@ -58,7 +57,7 @@ impl Ground {
         Some(ground)
     }
 
-    /// Measures the ground again, by heights above what it was so far.
+    /// Measures the ground again, relative to the previous estimate.
     fn measure(&mut self, points: &[(DVec3, f64)], level: f64) {
         let mut areas: Vec<BTreeMap<i64, f64>> = vec![BTreeMap::new(); self.heights.len()];
         for (point, area) in points {
@@ -74,7 +73,7 @@ impl Ground {
         self.heights.iter_mut().zip(planes(&of_tiles, self.n)).for_each(|(height, above)| *height += above);
     }
 
-    /// Returns how high a point lies above the ground; NaN where none is near.
+    /// Height of a point above the ground; NaN where none is near.
     pub(super) fn height_of(&self, point: DVec3) -> f64 {
         let axis = |i: usize| {
             let last = self.n[i] as f64 - 1.0;
@@ -106,8 +105,7 @@ fn ground_level(areas: &BTreeMap<i64, f64>) -> Option<f64> {
     Some(sum / near().map(|(_, area)| area).sum::<f64>())
 }
 
-/// Returns the height of each tile on a plane through those around it: slopes and height are medians, so that neither
-/// roofs nor gaps move it.
+/// Height of each tile on a plane through its neighbours: slopes and height are medians, robust to roofs and gaps.
 fn planes(of_tiles: &[f64], n: [usize; 2]) -> Vec<f64> {
     let around = |at: usize, n: usize| at.saturating_sub(AROUND)..(at + AROUND + 1).min(n);
     let of_tile = |x: usize, y: usize| {
@@ -137,7 +135,7 @@ fn planes(of_tiles: &[f64], n: [usize; 2]) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    /// A slope of 1 in 10, 300 resolutions wide, a point a resolution.
+    /// A slope of 1 in 10, 300 resolutions wide, one point per resolution.
     fn slope() -> Vec<(DVec3, f64)> {
         let at = |i: u32| DVec3::new(f64::from(i % 300), f64::from(i / 300), f64::from(i % 300) / 10.0);
         (0..90_000).map(|i| (at(i), 1.0)).collect()
@@ -162,7 +160,7 @@ mod tests {
         }
     }
 
-    /// By hand: a room's floor has half of its ceiling's surface, for furniture hides the rest.
+    /// By hand: a room's floor shows half of its ceiling's surface, for furniture hides the rest.
     #[test]
     fn floor_is_the_ground_not_its_ceiling() {
         let flat = |z: f64, area: f64| {

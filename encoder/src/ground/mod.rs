@@ -1,7 +1,7 @@
 //! The ground, and what stands on it: in photos from above a car and its park have one colour, but not one height.
 //!
-//! Surveys have separated things from terrain by height since laser scanners fly (Zhang et al., "A Progressive
-//! Morphological Filter", IEEE TGRS 41(4), 2003).
+//! Separating things from terrain by height follows laser scanning (Zhang et al., "A Progressive Morphological
+//! Filter", IEEE TGRS 41(4), 2003).
 
 mod height;
 mod standing;

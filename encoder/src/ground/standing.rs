@@ -10,48 +10,44 @@ use super::height::Ground;
 use super::up;
 use crate::memory::{MemoryPlan, Phase};
 
-/// The thing at a place where none stands.
 pub(crate) const NO_THING: u32 = u32::MAX;
 
 /// Gaussians below this opacity are no surface.
 const MIN_OPACITY: f32 = 0.1;
-/// Larger ones are sky and haze, resolutions.
+/// Larger Gaussians are sky and haze, resolutions.
 const MAX_SCALE: f64 = 30.0;
 /// Side of a voxel, resolutions.
 const VOXEL: f64 = 4.0;
 /// Height from which a place is above the ground, resolutions.
 const MIN_HEIGHT: f64 = 2.0;
 const MIN_GAUSSIANS: u32 = 10;
-/// A thing is narrower than this share of the ground: of walls and what touches them a room consists.
+/// Wider things, as a share of the ground, are walls and what touches them: a room consists of these.
 const MAX_WIDTH: f64 = 0.25;
-/// A wider patch of ground is no thing but a road, a lawn, a floor: as a share of the ground's width, under the sky and
-/// under a roof, where rugs lie.
+/// Wider patches of ground, as a share of its width, are roads, lawns and floors, not things: under the sky, and under
+/// a roof, where rugs lie.
 const MAX_PATCH: [f64; 2] = [0.125, 0.35];
-/// Most Gaussians that the ground is measured by.
+/// Most Gaussians used to measure the ground.
 const SAMPLE: usize = 1 << 22;
-/// Standard deviations of a Gaussian that it reaches; with 1 what stands close together is one thing.
+/// Reach of a Gaussian in standard deviations; with 1, things close together merge.
 const REACH: f64 = 0.5;
-/// Gaussians that are looked at before their parts are told.
 const AT_ONCE: usize = 1 << 16;
-/// Bits of a voxel's coordinate.
 const BITS: u32 = 21;
 
-/// The things that stand on a scene's ground; none by default.
+/// Things on a scene's ground; none by default.
 #[derive(Debug, Default)]
 pub(crate) struct Standing(Option<Things>);
 
 #[derive(Debug)]
 struct Things {
-    /// Rotation from the world to axes with z up.
+    /// Rotation to axes with z up.
     upright_from_world: DMat3,
     ground: Ground,
-    /// World units: the median size of a Gaussian.
+    /// World units: median size of a Gaussian.
     resolution: f64,
-    /// Voxels of things, ascending.
+    /// Ascending.
     voxels: Vec<u64>,
-    /// The thing of each.
     of_voxel: Vec<u32>,
-    /// Of each thing, whether it is less wide than what the scene consists of.
+    /// By thing: narrower than what the scene consists of.
     is_narrow: Vec<bool>,
 }
 
@@ -59,9 +55,9 @@ struct Things {
 pub(crate) struct Footprint {
     n: u32,
     n_standing: u32,
-    /// Gaussians on the ground with a wide thing above them.
+    /// Gaussians on the ground below a wide thing.
     n_roofed: u32,
-    /// Corners of the box around their means, in upright axes.
+    /// Corners of the means' box, in upright axes.
     low: DVec2,
     high: DVec2,
 }
@@ -70,7 +66,7 @@ impl Footprint {
     const NONE: Self =
         Self { n: 0, n_standing: 0, n_roofed: 0, low: DVec2::INFINITY, high: DVec2::NEG_INFINITY };
 
-    /// Returns what both cover.
+    /// Union of both.
     pub(crate) fn with(self, other: Self) -> Self {
         Self {
             n: self.n + other.n,
@@ -88,7 +84,7 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
 }
 
 impl Standing {
-    /// Finds what stands on the ground. Most `views` have the sky above them or the ground before them.
+    /// Assumes that most `views` have the sky above them or the ground before them.
     pub(crate) fn find(scene: &Gaussians, views: &[View]) -> Self {
         Self(Things::find(scene, up_by(scene, views)))
     }
@@ -101,7 +97,7 @@ impl Standing {
         self.0.as_ref().map_or(0, |things| things.is_narrow.len())
     }
 
-    /// Returns the thing that a point belongs to, or [`NO_THING`].
+    /// Thing at a point, or [`NO_THING`].
     pub(crate) fn at(&self, point_in_world: DVec3) -> u32 {
         let thing = |things: &Things| {
             let voxel = things.voxel_of(things.upright_from_world * point_in_world)?;
@@ -110,7 +106,7 @@ impl Standing {
         self.0.as_ref().and_then(thing).unwrap_or(NO_THING)
     }
 
-    /// Returns what each of `n_parts` covers; empty where no ground was found. `part_of`: of each Gaussian.
+    /// Footprint of each of `n_parts`; empty if no ground was found. `part_of`: of each Gaussian.
     pub(crate) fn footprints(&self, scene: &Gaussians, part_of: &[u32], n_parts: usize) -> Vec<Footprint> {
         let Some(things) = &self.0 else { return Vec::new() };
         let lies = |mean: &DVec3| {
@@ -131,7 +127,7 @@ impl Standing {
         found
     }
 
-    /// Returns whether most of what covers this is ground, and wider than things that lie on it.
+    /// Mostly ground, and wider than things that lie on it.
     pub(crate) fn is_bare_ground(&self, footprint: &Footprint) -> bool {
         let Footprint { n, n_standing, n_roofed, low, high } = *footprint;
         let most = MAX_PATCH[usize::from(2 * n_roofed > n - n_standing)];
@@ -139,8 +135,7 @@ impl Standing {
         2 * n_standing < n && self.0.as_ref().is_some_and(is_wide)
     }
 
-    /// Returns the narrow thing at a point, or beside it as far as a voxel, where a drawing's depth is that exact; or
-    /// [`NO_THING`].
+    /// Narrow thing at a point or within a voxel of it, which is the accuracy of a drawing's depth; or [`NO_THING`].
     pub(crate) fn shown_at(&self, point_in_world: DVec3) -> u32 {
         let thing = |things: &Things| {
             let voxel = things.voxel_of(things.upright_from_world * point_in_world)?;
@@ -181,13 +176,13 @@ impl Things {
         Some(things)
     }
 
-    /// Returns the voxel of a point in upright axes; `None` on the ground, below it, and far from the scene.
+    /// Voxel of a point in upright axes; `None` on or below the ground, and far from the scene.
     fn voxel_of(&self, point: DVec3) -> Option<u64> {
         let is_above = self.ground.height_of(point) >= MIN_HEIGHT * self.resolution;
         self.place_of(point).filter(|_| is_above)
     }
 
-    /// Returns the voxel of a point in upright axes, also where none can be; `None` far from the scene.
+    /// Like `voxel_of`, but on and below the ground, too.
     fn place_of(&self, point: DVec3) -> Option<u64> {
         let half = f64::from(1_u32 << (BITS - 1));
         let at = (point / (VOXEL * self.resolution)).floor() + half;
@@ -195,7 +190,6 @@ impl Things {
         is_within.then(|| at.to_array().into_iter().fold(0, |key, at| key << BITS | at as u64))
     }
 
-    /// Returns whether the highest thing above a point is wide.
     fn is_roofed(&self, point: DVec3) -> bool {
         let Some(place) = self.place_of(point) else { return false };
         let top_of_column = place | ((1 << BITS) - 1);
@@ -209,7 +203,7 @@ impl Things {
         self.voxels.binary_search(&voxel).ok().map(|at| self.of_voxel[at])
     }
 
-    /// Joins voxels that touch each other. `touched`: ascending, and whether it is that of a Gaussian's mean.
+    /// Joins touching voxels. `touched`: ascending, and whether it contains a Gaussian's mean.
     fn join(&mut self, touched: &[(u64, bool)]) {
         let of_voxel =
             |same: &[(u64, bool)]| (same[0].0, same.iter().filter(|(_, has_mean)| *has_mean).count() as u32);
@@ -244,17 +238,16 @@ impl Things {
     }
 }
 
-/// Returns the two larger standard deviations of a Gaussian, ascending.
+/// The two larger standard deviations, ascending.
 fn larger_axes(scene: &Gaussians, i: usize) -> [f64; 2] {
     let mut scales = scene.scales[i].map(f64::from);
     scales.sort_by(f64::total_cmp);
     [scales[1], scales[2]]
 }
 
-/// Returns the mean of a Gaussian and places around it, at most as far apart as voxels: those of a plain wall are larger
-/// than voxels.
+/// The mean of a Gaussian and places around it, at most a voxel apart: Gaussians of plain walls are larger than voxels.
 fn reaches(scene: &Gaussians, i: usize, side: f64) -> Vec<DVec3> {
-    // A needle reaches as far as it is wide: along its length it would join what stands close together.
+    // A needle reaches as far as it is wide: its length would join things close together.
     let middle = larger_axes(scene, i)[0];
     let scales = scene.scales[i].map(|scale| f64::from(scale).min(middle));
     let steps = scales.map(|scale| (scale / side + 0.5) as i32);
@@ -272,13 +265,13 @@ fn reaches(scene: &Gaussians, i: usize, side: f64) -> Vec<DVec3> {
     places.map(|place| world_from_axes * place).collect()
 }
 
-/// Returns the steps from a voxel to those after it that share a face or an edge: half of 18.
+/// Steps to the voxels that share a face or an edge: 9 of 18, the rest by symmetry.
 fn steps() -> impl Iterator<Item = u64> {
     let [x, y, z] = [1 << (2 * BITS), 1 << BITS, 1];
     [x, y, z, x + y, x - y, x + z, x - z, y + z, y - z].into_iter()
 }
 
-/// Returns the upward direction, unit. The Gaussians tell the axis; views have it above them or the ground before them.
+/// Unit vector. The Gaussians determine the axis, the views its sign: they have up above or the ground before them.
 fn up_by(scene: &Gaussians, views: &[View]) -> DVec3 {
     let axis = up::find(scene).axis;
     let away = |view: &View| {
@@ -292,8 +285,7 @@ fn up_by(scene: &Gaussians, views: &[View]) -> DVec3 {
 mod tests {
     use super::*;
 
-    /// By hand: a field of 30 x 30 m, half of it under a roof; a Gaussian every 10 cm. An eighth of it are 3.75 m, 0.35
-    /// of it are 10.5 m.
+    /// By hand: a field of 30 x 30 m, half of it roofed, a Gaussian every 10 cm. An eighth is 3.75 m, 0.35 is 10.5 m.
     #[test]
     fn a_wide_patch_is_bare_ground_and_under_a_roof_a_wider_one() {
         let field = (0..90_000).map(|i| (f64::from(i % 300) * 0.1, f64::from(i / 300) * 0.1));

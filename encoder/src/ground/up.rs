@@ -6,26 +6,26 @@ use slag_common::Gaussians;
 use slag_math::eigen::eigen_symmetric;
 use slag_math::stats::{median, trimmed_range};
 
-/// Directions that are tried, on a half of the sphere: the nearest is within 3 degrees.
+/// Directions tried on half of the sphere: the nearest is within 3 degrees.
 const N_DIRECTIONS: usize = 1000;
 const MAX_NORMALS: usize = 1 << 20;
-/// Cosine of the angle within which normals agree, 8 degrees.
+/// Cosine of the largest angle between agreeing normals, 8 degrees.
 const AGREE: f64 = 0.990;
-/// Shortest of the axes of a flat Gaussian, relative to the next: 0.3 leaves those of surfaces.
+/// Largest ratio of a flat Gaussian's shortest axis to the next: 0.3 leaves those of surfaces.
 const FLAT: f64 = 0.3;
-/// Share of the normals that a direction needs: rooms have 34 %, yards 17 %, a guitar 8 %.
+/// Least share of the normals for a direction: rooms have 34 %, yards 17 %, a guitar 8 %.
 const MIN_SUPPORT: f64 = 0.12;
-/// Share, of the best direction's support, from which another direction is as well a surface's.
+/// Share of the best direction's support from which another direction is a surface's, too.
 const RIVAL: f64 = 0.3;
-/// Least spread, relative to the next, from which no axis is the vertical.
+/// Least spread, relative to the next, above which no axis is vertical.
 const MAX_SPREAD: f64 = 0.6;
 /// Gaussians below this opacity are no surface, and occupy nothing.
 const MIN_OPACITY: f32 = 0.3;
-/// How far the median height lies below the middle, relative to the height, before it tells up from down.
+/// The median height must lie this far below the middle, relative to the height, to tell up from down.
 const MIN_SKEW: f64 = 0.03;
-/// Share that is trimmed at either end of an extent.
+/// Trimmed share at either end of an extent.
 pub(crate) const TRIMMED: f64 = 0.02;
-/// Where nothing tells the vertical: cameras of photos have y down, and so have most files.
+/// Default without evidence: cameras of photos have y down, and so have most files.
 pub(crate) const OF_FILES: DVec3 = DVec3::NEG_Y;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,7 +33,6 @@ pub(crate) enum Sign {
     Known,
     /// The axis may point down.
     Unknown,
-    /// Nothing tells the axis.
     Assumed,
 }
 
@@ -44,8 +43,8 @@ pub(crate) struct Up {
     pub(crate) sign: Sign,
 }
 
-/// Finds the vertical: the direction that most normals have; of several alike, as those of walls and floors, the one
-/// along which the scene extends least. Without any, the axis of least spread; without that, the files' own.
+/// Finds the vertical: the direction of most normals; of several, such as walls and floors, the one of least extent.
+/// Without any, the axis of least spread; without that, the files' own.
 pub(crate) fn find(scene: &Gaussians) -> Up {
     let normals = normals(scene);
     let total: f64 = normals.iter().map(|(_, weight)| weight).sum();
@@ -62,12 +61,11 @@ pub(crate) fn find(scene: &Gaussians) -> Up {
     }
 }
 
-/// Returns the Gaussians that belong to surfaces.
 pub(crate) fn solid(scene: &Gaussians) -> impl Iterator<Item = usize> {
     (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY)
 }
 
-/// Returns normals of flat Gaussians, with weights that the largest do not rule.
+/// Normals of flat Gaussians, with weights that the largest do not dominate.
 fn normals(scene: &Gaussians) -> Vec<(DVec3, f64)> {
     let stride = scene.len().div_ceil(MAX_NORMALS).max(1);
     let flat = solid(scene).step_by(stride).filter_map(|i| {
@@ -86,7 +84,7 @@ fn normals(scene: &Gaussians) -> Vec<(DVec3, f64)> {
     flat
 }
 
-/// Returns the directions that most normals have, far from each other, best first, with their share of the weight.
+/// Most frequent normals, far apart, best first, with their share of the weight.
 fn peaks(normals: &[(DVec3, f64)], total: f64) -> Vec<(DVec3, f64)> {
     // A spiral of equal areas over the upper half of the sphere.
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
@@ -104,7 +102,7 @@ fn peaks(normals: &[(DVec3, f64)], total: f64) -> Vec<(DVec3, f64)> {
     tried.sort_by(|a, b| b.1.total_cmp(&a.1));
     let mut found: Vec<(DVec3, f64)> = Vec::new();
     for (start, _) in tried {
-        // 37 degrees from another peak.
+        // 37 degrees from other peaks.
         if found.len() < 3 && found.iter().all(|(axis, _)| axis.dot(start).abs() < 0.8) {
             let axis = (0..4).fold(start, |axis, _| refined(normals, axis));
             found.push((axis, support(axis)));
@@ -114,18 +112,18 @@ fn peaks(normals: &[(DVec3, f64)], total: f64) -> Vec<(DVec3, f64)> {
     found
 }
 
-/// Returns the mean of the normals that agree with an axis.
+/// Mean of the normals that agree with an axis.
 fn refined(normals: &[(DVec3, f64)], axis: DVec3) -> DVec3 {
     let agree = normals.iter().filter(|(normal, _)| normal.dot(axis).abs() >= AGREE);
     let sum: DVec3 = agree.map(|(normal, weight)| *normal * normal.dot(axis).signum() * *weight).sum();
     sum.try_normalize().unwrap_or(axis)
 }
 
-/// Returns the axis along which the Gaussians spread least, if they do so clearly.
+/// Axis of least spread, if it is clearly least.
 fn least_spread(scene: &Gaussians) -> Option<DVec3> {
     let n = scene.len().max(1) as f64;
     let mean = scene.means_in_world.iter().sum::<DVec3>() / n;
-    // Far Gaussians, of a sky, count as one at the edge.
+    // Far Gaussians, as in a sky, count as one at the edge.
     let mut distances: Vec<f64> = scene.means_in_world.iter().map(|at| at.distance(mean)).collect();
     let edge = 2.0 * median(&mut distances)?;
     let mut covariance = DMat3::ZERO;
@@ -138,17 +136,17 @@ fn least_spread(scene: &Gaussians) -> Option<DVec3> {
     (values[2].max(0.0).sqrt() < MAX_SPREAD * values[1].max(0.0).sqrt()).then_some(axis)
 }
 
-/// Returns where solid Gaussians lie along an axis.
+/// Positions of solid Gaussians along an axis.
 fn along(scene: &Gaussians, axis: DVec3) -> Vec<f64> {
     solid(scene).map(|i| scene.means_in_world[i].dot(axis)).collect()
 }
 
-/// Returns the range of solid Gaussians along an axis, without strays.
+/// Range of solid Gaussians along an axis, without strays.
 pub(crate) fn extent(scene: &Gaussians, axis: DVec3) -> Option<(f64, f64)> {
     trimmed_range(&mut along(scene, axis), TRIMMED)
 }
 
-/// Points an axis upward: things stand on the ground, so that most of a scene lies in the lower half of its height.
+/// Points an axis upward: things stand on the ground, so most of a scene lies in the lower half of its height.
 fn with_sign(scene: &Gaussians, axis: DVec3) -> Up {
     let middle = median(&mut along(scene, axis));
     let (Some((low, high)), Some(middle)) = (extent(scene, axis), middle) else {

@@ -50,7 +50,7 @@ pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let text = files::text_of(&bytes);
     let text = text.map_err(|source| GeoError::Text { path: path.to_owned(), source })?;
     let malformed = |source| GeoError::Json { path: path.to_owned(), source };
-    // Maps, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's; then structs, since a map
+    // Maps first, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's; then structs, since a map
     // would take a name twice.
     let maps: HashMap<String, Value> = serde_json::from_str(text).map_err(malformed)?;
     if let Some(origin) = maps.get("origin") {
@@ -61,7 +61,7 @@ pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
         true => Ok(value),
         false => Err(GeoError::Range { path: path.to_owned(), field, value, min, max }),
     };
-    // The range of heights is from the deepest trench to the edge of space.
+    // Heights range from the deepest trench to the edge of space.
     let latitude_deg = range("lat", origin.lat, -90.0, 90.0)?;
     let longitude_deg = range("lon", origin.lon, -180.0, 180.0)?;
     let origin =

@@ -19,27 +19,27 @@ pub use splat_frame::{Activated, FrameChoice, to_poses};
 pub(crate) use splat_frame::{FoundFrame, find_frame};
 pub use undistort::Undistorter;
 
-/// Largest factor between the size in the intrinsics and that of downscaled photos.
+/// Largest factor by which photos may be downscaled from the size in the intrinsics.
 const MAX_DOWNSCALE: u32 = 64;
-/// Bytes that a pixel takes while its photo is loaded: eight as read (16 bits, transparent), three as colours; three
-/// without distortion, once the first are gone, and its place before.
+/// Peak bytes per pixel while a photo is loaded: eight as read (16 bits, transparent), three as colours; three without
+/// distortion, which replace the first.
 pub(crate) const LOADED_BYTES_PER_PX: u64 = 11;
 
 #[derive(Clone, Debug)]
 pub struct LoadedImage {
-    /// The view, with the size of the image and pinhole intrinsics.
+    /// With the size of the image and pinhole intrinsics.
     pub view: View,
-    /// The pixels; black outside the lens image.
+    /// Black outside the lens image.
     pub image: RgbImage,
-    /// The mapping that undistorted the image, if the lens has distortion.
+    /// The applied mapping, if the lens has distortion.
     pub undistorter: Option<Undistorter>,
-    /// Pixels inside the lens image that are not transparent, row-major; `None` if all are.
+    /// Opaque pixels inside the lens image, row-major; `None` if all are.
     pub valid: Option<Vec<bool>>,
-    /// Whether its file has an EXIF orientation, which is ignored: poses are computed from the pixels as stored.
+    /// Whether an EXIF orientation was ignored: poses are computed from the pixels as stored.
     pub is_rotated: bool,
 }
 
-/// Counts the photos with an EXIF orientation: a camera that is held upright makes thousands of them.
+/// Counts photos with an EXIF orientation: a camera held upright makes thousands of them.
 #[derive(Debug, Default)]
 pub struct RotatedPhotos(Mutex<(usize, String)>);
 
@@ -99,14 +99,14 @@ struct Drawn {
     drawn_from: String,
 }
 
-/// Returns the splat from which the images of a poses file were drawn; `None` where they are photos. Only
-/// transforms.json says so, of `plan` and `draw`.
+/// The splat that a poses file's images were drawn from; `None` for photos. Only transforms.json of `plan` and `draw`
+/// says so.
 pub fn drawn_from(poses: &Path) -> Option<String> {
     let inside = poses.join("transforms.json");
     let path = if poses.is_dir() { &inside } else { poses };
     let is_json = path.extension().is_some_and(|extension| extension == "json");
     let bytes = is_json.then(|| fs_err::read(path).ok())??;
-    // What is malformed is told by the reader of poses.
+    // The reader of poses reports malformed files.
     serde_json::from_str::<Drawn>(files::text_of(&bytes).ok()?).ok().map(|drawn| drawn.drawn_from)
 }
 
@@ -114,17 +114,17 @@ pub(crate) fn hash_file(path: &Path) -> io::Result<Hash32> {
     Ok(Hash32::of_reader(fs_err::File::open(path)?)?.0)
 }
 
-/// Returns the views without an image file, in the given order.
+/// Views without an image file, in the given order.
 pub fn missing_images(views: &[View]) -> Vec<&View> {
     views.iter().filter(|view| !view.image_path.is_file()).collect()
 }
 
-/// Returns the pixels of a view's photo, see [`photo_size_px`].
+/// Area of [`photo_size_px`].
 pub(crate) fn photo_area_px(view: &View) -> u64 {
     photo_size_px(view).map(u64::from).iter().product()
 }
 
-/// Returns the size of a view's photo by its header; that of the camera where the header cannot be read.
+/// Size of a view's photo by its header; the camera's if the header cannot be read.
 fn photo_size_px(view: &View) -> [u32; 2] {
     let of_header = || {
         let input = BufReader::new(files::open(&view.image_path).ok()?);
@@ -175,7 +175,7 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     or_blank(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), is_rotated })
 }
 
-/// Returns the pixels, and whether the file has an EXIF orientation that was ignored.
+/// Returns the pixels, and whether an EXIF orientation was ignored.
 fn decode(path: &Path, camera: &Intrinsics) -> Result<(DynamicImage, bool), IngestError> {
     let failed = |fault| match fault {
         PhotoError::Io(error) => IngestError::Io(error),
@@ -184,7 +184,7 @@ fn decode(path: &Path, camera: &Intrinsics) -> Result<(DynamicImage, bool), Inge
     let mut decoder = photo::open(BufReader::new(files::open(path)?)).map_err(failed)?;
     let (width_px, height_px) = decoder.dimensions();
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    // Checks the size before it allocates any pixel.
+    // Before any pixel is allocated.
     let fits = is_scale_of(camera, width_px, height_px);
     let turns = swaps_sides(orientation) && is_scale_of(camera, height_px, width_px);
     if !fits && !turns {
@@ -206,8 +206,8 @@ fn swaps_sides(orientation: Orientation) -> bool {
     matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// Returns whether a size is exactly proportional to that of the camera, or is a reduction of it by an integer
-/// factor with each side rounded up or down, as in downscaled copies.
+/// Whether a size is exactly proportional to the camera's, or that divided by an integer with each side rounded up or
+/// down, as in downscaled copies.
 fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
     let proportional = u64::from(width_px) * u64::from(camera.height_px)
         == u64::from(height_px) * u64::from(camera.width_px);

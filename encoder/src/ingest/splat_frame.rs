@@ -24,7 +24,7 @@ pub struct Activated {
 }
 
 impl Activated {
-    /// Brings a splat that was decoded as usual to the values of its file.
+    /// Restores the file's values in a splat that was decoded as usual.
     pub(crate) fn undo(self, scene: &mut Gaussians) {
         if self != Self::default() {
             scene.deactivate(self.scales, self.opacities);
@@ -32,15 +32,13 @@ impl Activated {
     }
 }
 
-/// A file that states the splat's frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FoundFrame {
     pub path: PathBuf,
     pub stated: SplatFromPoses,
 }
 
-/// Looks for the file that states the frame of the splat at `scene`; `source` and `applied` are those of the
-/// poses.
+/// Finds the file with the frame of the splat at `scene`; `source` and `applied` are those of the poses.
 pub(crate) fn find_frame(
     scene: &Path,
     choice: &FrameChoice,
@@ -68,8 +66,8 @@ impl FoundFrame {
     }
 }
 
-/// Brings the splat at `path` into the world of the poses, if a file states its frame. Harmonics above degree 0 are
-/// dropped then. `source` and `applied` are those of the poses.
+/// Moves the splat at `path` into the poses' world if a file states its frame, and then drops harmonics above degree 0.
+/// `source` and `applied` are those of the poses.
 pub fn to_poses(
     scene: &mut Gaussians,
     path: &Path,

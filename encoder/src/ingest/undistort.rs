@@ -3,23 +3,22 @@
 use image::RgbImage;
 use slag_common::Intrinsics;
 
-/// The mapping from a camera with distortion to the ideal pinhole of the same focal lengths, centre and size.
+/// Mapping from a camera with distortion to the ideal pinhole of equal focal lengths, centre and size.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Undistorter {
-    /// The camera with distortion, at the size of the image.
+    /// At the size of the image.
     camera: Intrinsics,
     /// Normalised radius beyond which the lens polynomial is no longer monotonic.
     max_radius: f64,
 }
 
 impl Undistorter {
-    /// Creates the mapping of a camera with the size of the images.
+    /// `camera` must have the size of the images.
     pub fn new(camera: Intrinsics) -> Self {
         Self { camera, max_radius: camera.distortion.monotonic_radius() }
     }
 
-    /// Returns the position of the centre of an ideal pixel in the distorted image, pixels; `None` outside the
-    /// image or the range of the lens model.
+    /// Position of an ideal pixel's centre in the distorted image, pixels; `None` outside the image or the lens model.
     fn source_px(&self, column: u32, row: u32) -> Option<[f64; 2]> {
         let ideal = self.camera.distorted_from_pixel([f64::from(column) + 0.5, f64::from(row) + 0.5]);
         if ideal[0].hypot(ideal[1]) > self.max_radius || self.camera.distortion.folds_at(ideal) {
@@ -31,8 +30,7 @@ impl Undistorter {
         inside.then_some([u, v])
     }
 
-    /// Returns the ideal image, sampled bilinearly, and whether each of its pixels (row-major) is inside the
-    /// photo. Pixels outside are black.
+    /// Ideal image, bilinear, black outside the photo, and whether each pixel (row-major) is inside.
     pub fn image(&self, photo: &RgbImage) -> (RgbImage, Vec<bool>) {
         let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
         assert_eq!(photo.dimensions(), (width_px, height_px), "the undistorter is of another size");
@@ -48,8 +46,7 @@ impl Undistorter {
         (ideal, valid)
     }
 
-    /// Maps labels (row-major) to the ideal image by nearest neighbour. Pixels outside the photo get the label
-    /// `outside`.
+    /// Maps labels (row-major) to the ideal image, nearest neighbour; pixels outside the photo get `outside`.
     pub fn labels(&self, labels: &[u32], outside: u32) -> Vec<u32> {
         let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
         assert_eq!(
@@ -60,7 +57,7 @@ impl Undistorter {
         let mut ideal = Vec::with_capacity(labels.len());
         for row in 0..height_px {
             ideal.extend((0..width_px).map(|column| match self.source_px(column, row) {
-                // Truncation gives the pixel that contains the position: pixel i spans i..i + 1.
+                // Truncation is correct: pixel i spans i..i + 1.
                 Some([u, v]) => labels[v as usize * width_px as usize + u as usize],
                 None => outside,
             }));
@@ -69,8 +66,7 @@ impl Undistorter {
     }
 }
 
-/// Returns the colour at a position, pixels, interpolated between the four pixel centres around it. Within half a
-/// pixel of the border, the colour is that of the edge.
+/// Bilinear colour at a position in pixels; within half a pixel of the border, that of the edge.
 fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> [u8; 3] {
     let axis = |position: f64, size_px: u32| {
         let from_centre = (position - 0.5).clamp(0.0, f64::from(size_px - 1));

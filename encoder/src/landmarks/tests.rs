@@ -7,7 +7,7 @@ use super::*;
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-/// A row of cameras before a wall of points that all of them see: the lists take no more than is reserved.
+/// Cameras in a row see all points of a wall: the lists take no more than is reserved.
 #[test]
 fn lists_of_landmarks_are_reserved() {
     let (n_views, n_gaussians) = (30, 100_000);

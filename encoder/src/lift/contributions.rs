@@ -20,7 +20,7 @@ const MAGIC: [u8; 8] = *b"SLAGCONT";
 const VERSION: u32 = 2;
 const REGION_BITS: u32 = 20;
 
-/// Gaussians of a slice: the contributions of one slice from all views fit a core's cache.
+/// Contributions of one slice from all views fit a core's cache.
 pub(crate) const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
 /// Most regions, or masks, of all views and mixtures together.
 pub(crate) const MAX_IN_ALL: usize = u32::MAX as usize - 1;
@@ -32,7 +32,7 @@ mod section {
     pub(crate) const REGION_MASKS: u32 = 3;
     pub(crate) const MASK_VECTORS: u32 = 4;
     pub(crate) const RUNS: u32 = 5;
-    /// Follows the container; errors name the section by this number.
+    /// After the container; errors name the section by this number.
     pub(crate) const ENTRIES: u32 = 6;
 }
 
@@ -47,29 +47,28 @@ struct Header {
     n_entries: u64,
 }
 
-/// The contributions of one slice of a cell, from `start` to the start of the next run.
+/// Contributions of one slice of a cell, up to the start of the next run.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Run {
     pub cell_id: u32,
-    /// The slice: index within the cell / [`GAUSSIANS_PER_SLICE`].
+    /// Index within the cell / [`GAUSSIANS_PER_SLICE`].
     pub(crate) slice: u32,
-    /// Its first entry in the file.
     pub start: u64,
-    /// CRC-32 of its entries.
+    /// CRC-32 of the entries.
     checksum: u64,
 }
 
 /// A contribution `a(k, r)`: the blending weight of a Gaussian, summed over the pixels of a region.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contribution {
-    /// The Gaussian, by its index within its cell.
+    /// Index of the Gaussian within its cell.
     pub local: u32,
     pub region: u32,
     pub weight: f32,
 }
 
-/// A [`Contribution`] of a known slice, in the form of the file.
+/// A [`Contribution`] of a known slice, as in the file.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct PackedEntry {
@@ -119,14 +118,14 @@ pub enum ContributionError {
     TooManyRegions { path: PathBuf, found: usize },
 }
 
-/// Returns the CRC-32 of some entries: at a gigabyte per scene a cryptographic hash would be the slowest step of
-/// the lift. Storage and network have checksums of their own.
+/// CRC-32: for a gigabyte per scene a cryptographic hash would be the lift's slowest step. Storage and network have
+/// checksums of their own.
 fn checksum(entries: &[PackedEntry]) -> u64 {
     u64::from(crc32fast::hash(bytemuck::cast_slice(entries)))
 }
 
 impl ViewContributions {
-    /// Groups a view's weights by cell. `weights` are sorted by (Gaussian, region).
+    /// Groups a view's weights, sorted by (Gaussian, region), by cell.
     pub fn new(
         weights: &[RegionWeight],
         masks_of_region: Vec<Vec<u32>>,
@@ -156,7 +155,7 @@ impl ViewContributions {
         Ok(slag_common::durable::write(path, &self.to_bytes(path)?)?)
     }
 
-    /// Returns the file's bytes. `path`: its name, for errors.
+    /// `path`: its name, for errors.
     pub fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, ContributionError> {
         let found = self.masks_of_region.len();
         if found > MAX_REGIONS {
@@ -206,7 +205,7 @@ impl ViewContributions {
     }
 }
 
-/// A contribution file, checked except for the contributions: these are checked on reading.
+/// A contribution file; its entries are checked on reading, the rest on opening.
 #[derive(Clone, Debug)]
 pub struct ContributionFile {
     pub(super) path: PathBuf,
@@ -311,7 +310,6 @@ impl ContributionFile {
     }
 }
 
-/// Checks a file's container.
 fn parse(bytes: &[u8]) -> Result<(Header, ViewRegions, Vec<Run>), ContainerError> {
     let layout = Layout::check(bytes, MAGIC, VERSION)?;
     let header: Header = layout.value(bytes, section::HEADER, "header")?;

@@ -1,9 +1,8 @@
 //! The embeddings of many Gaussians at once, from their contributions.
 //!
-//! A component of an embedding is a sum over hundreds of region vectors, far more than fit a cache. So
-//! neighbouring Gaussians, which share most of their regions, are processed together, a block of components at a
-//! time. Every component is summed in the order of the entries, and products are rounded before they are added:
-//! the bits are the same on any machine.
+//! A component is a sum over hundreds of region vectors, far more than fit a cache. So neighbouring Gaussians, which
+//! share most of their regions, are processed together, a block of components at a time. Components are summed in the
+//! order of the entries, and products are rounded before they are added: the bits are the same on any machine.
 
 use std::ops::Range;
 
@@ -15,29 +14,28 @@ use super::table::RegionTable;
 use slag_math::dot;
 use slag_math::simd::{InstructionSet, Work};
 
-/// Shortest mean vector with evidence. The masks of a shorter one cancel: the rest is rounding noise of f32
-/// contributions and of the models.
+/// Shortest mean vector with evidence. Below it, masks cancel: the rest is rounding noise of f32 contributions and of
+/// the models.
 pub(super) const MIN_MEAN_LENGTH: f32 = 1e-3;
-/// Gaussians processed together: their embeddings stay in a core's cache until they are scaled.
+/// Gaussians processed together: their embeddings stay in a core's cache until scaled.
 const CHUNK: usize = 512;
 const BLOCK: usize = 128;
-/// Registers that hold sums: enough to hide the latency of an addition. A block fills them at any width.
+/// Registers for sums: enough to hide the latency of an addition. A block fills them at any width.
 const REGISTERS: usize = 8;
 const UNSEEN: u32 = u32::MAX;
 
-/// Working memory of one thread.
 struct Scratch {
-    /// `[n_regions]`: place of each region among the chunk's, or [`UNSEEN`].
+    /// `[n_regions]`: index of each region in the chunk, or [`UNSEEN`].
     place_of_region: Vec<u32>,
     regions: Vec<u32>,
-    /// Place of the region of each entry.
+    /// By entry: index of its region in the chunk.
     places: Vec<u32>,
-    /// A block of components of each of the chunk's region vectors.
+    /// A block of components of the chunk's region vectors.
     vectors: Vec<[f32; BLOCK]>,
 }
 
-/// Writes the unit embedding of each Gaussian of a part to `out` (`[N][dim]`), zeros where there is no
-/// evidence, and returns the lengths of their mean vectors, 0 where there is none.
+/// Writes the unit embeddings of a part's Gaussians to `out` (`[N][dim]`) and returns the lengths of their mean
+/// vectors; both are 0 without evidence.
 pub(super) fn write_embeddings(
     contributions: &PartContributions,
     table: &RegionTable,
@@ -77,8 +75,7 @@ fn write_embeddings_on(
     lengths
 }
 
-/// Scales a sum of region vectors to unit length and returns the mean vector's length, or zeros it and
-/// returns 0 where there is no evidence.
+/// Scales a sum of region vectors to unit length and returns the mean vector's length; zeros and 0 without evidence.
 #[inline(always)]
 pub(super) fn make_unit(sum: &mut [f32], total_weight: f32) -> f32 {
     let scale = if total_weight > 0.0 { total_weight.recip() } else { 0.0 };
@@ -94,7 +91,6 @@ pub(super) fn make_unit(sum: &mut [f32], total_weight: f32) -> f32 {
 }
 
 impl Scratch {
-    /// Numbers the regions of some Gaussians in the order of their first entry.
     fn number_regions(&mut self, contributions: &PartContributions, gaussians: Range<usize>) {
         let entries =
             contributions.starts[gaussians.start] as usize..contributions.starts[gaussians.end] as usize;
@@ -114,7 +110,6 @@ impl Scratch {
     }
 }
 
-/// The sums of region vectors of consecutive Gaussians.
 struct Chunk<'a> {
     contributions: &'a PartContributions,
     table: &'a RegionTable,
@@ -127,7 +122,6 @@ struct Chunk<'a> {
 impl<S: Simd> Work<S> for Chunk<'_> {
     type Output = Vec<f32>;
 
-    /// Returns the lengths of the mean vectors.
     #[inline(always)]
     fn run(self, simd: S) -> Vec<f32> {
         let Self { contributions, table, first, scratch, out } = self;
@@ -153,8 +147,7 @@ impl<S: Simd> Work<S> for Chunk<'_> {
     }
 }
 
-/// Writes the sum of `weight * vector` over some entries. The components of a step stay in registers until all
-/// entries are added.
+/// Writes the sum of `weight * vector` over some entries; sums stay in registers until all entries are added.
 #[inline(always)]
 fn add_vectors<S: Simd>(
     simd: S,

@@ -12,24 +12,24 @@ use super::table::{RegionTable, are_starts};
 const MAGIC: [u8; 8] = *b"SLAGFELD";
 const VERSION: u32 = 1;
 
-/// The sparse contributions of a cell's Gaussians, Gaussian by Gaussian.
+/// Sparse contributions of a cell, by Gaussian.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellField {
-    /// `[N]`: index of each Gaussian in the input file.
+    /// `[N]`: indices in the input file.
     pub input_indices: Vec<u32>,
-    /// `[N + 1]`: where each Gaussian's entries start.
+    /// `[N + 1]`: start of each Gaussian's entries.
     pub starts: Vec<u64>,
     pub regions: Vec<u32>,
     pub weights: Vec<f32>,
     /// `[N]`: `Σ_r a(k, r) n_r`, the evidence for the embedding.
     pub total_weights: Vec<f32>,
-    /// `[N]`: length of the mean vector, 0 where there is no evidence.
+    /// `[N]`: 0 without evidence.
     pub mean_lengths: Vec<f32>,
 }
 
 impl CellField {
-    /// Makes the field of a part and writes its embeddings to `embeddings` (`[N][dim]`): unit, or zeros where
-    /// there is no evidence. `input_indices`: of the part's Gaussians.
+    /// Makes a part's field and writes its embeddings to `embeddings` (`[N][dim]`): unit, or zeros without evidence.
+    /// `input_indices`: of the part's Gaussians.
     pub fn new(
         input_indices: Vec<u32>,
         contributions: PartContributions,
@@ -41,7 +41,6 @@ impl CellField {
         Self { input_indices, starts, regions, weights, total_weights, mean_lengths }
     }
 
-    /// Appends the next Gaussians of the same cell.
     pub(super) fn append(&mut self, next: Self) {
         let n_entries = self.regions.len() as u64;
         self.starts.extend(next.starts[1..].iter().map(|start| start + n_entries));
@@ -60,7 +59,6 @@ impl CellField {
         self.input_indices.is_empty()
     }
 
-    /// Returns the regions of a Gaussian's contributions, and their weights.
     pub fn entries(&self, k: usize) -> impl Iterator<Item = (usize, f32)> + '_ {
         let range = self.starts[k] as usize..self.starts[k + 1] as usize;
         self.regions[range.clone()].iter().map(|r| *r as usize).zip(self.weights[range].iter().copied())
@@ -70,7 +68,7 @@ impl CellField {
         self.mean_lengths[k] > 0.0
     }
 
-    /// Writes the unit embedding of a Gaussian, or zeros where it has no evidence.
+    /// Writes a Gaussian's unit embedding, or zeros without evidence.
     pub fn embedding(&self, k: usize, table: &RegionTable, out: &mut [f32]) {
         let mut vector = vec![0.0; table.dim()];
         out.fill(0.0);
@@ -81,8 +79,8 @@ impl CellField {
         make_unit(out, self.total_weights[k]);
     }
 
-    /// Returns the cosine of every Gaussian's embedding with a unit query, from the query's score
-    /// with each region ([`RegionTable::scores`]); NaN where there is no evidence.
+    /// Cosines of all embeddings with a unit query, from its scores with the regions ([`RegionTable::scores`]); NaN
+    /// without evidence.
     pub fn cosines(&self, region_scores: &[f32]) -> Vec<f32> {
         let cosine = |k: usize| {
             if !self.has_evidence(k) {
@@ -94,7 +92,6 @@ impl CellField {
         (0..self.len()).into_par_iter().map(cosine).collect()
     }
 
-    /// Writes the file form.
     pub fn write(&self, out: impl Write) -> io::Result<()> {
         let header = [self.len() as u64, self.regions.len() as u64];
         let sections = [
@@ -109,7 +106,7 @@ impl CellField {
         container::write(out, MAGIC, VERSION, &sections)
     }
 
-    /// Reads the file form; regions must be below `n_regions`.
+    /// Regions must be below `n_regions`.
     pub fn from_bytes(bytes: &AlignedBytes, n_regions: usize) -> Result<Self, ContainerError> {
         let layout = Layout::check(bytes, MAGIC, VERSION)?;
         let [n, n_entries]: [u64; 2] = layout.value(bytes, 1, "header")?;

@@ -14,45 +14,44 @@ use super::table::RegionTable;
 use crate::cells::CellSplit;
 use crate::memory::{MemoryPlan, Phase};
 
-/// Most entries of a part. A constant, not a share of the budget: parts are published, and a store must not depend
-/// on the memory of the machine that made it.
+/// Most entries of a part. Not a share of the budget: parts are published, and a store must not depend on the memory of
+/// the machine that made it.
 pub(super) const PART_ENTRIES: u64 = 1 << 22;
-/// Most entries of a group that is transposed, even where the budget allows more: a larger one leaves the
-/// processor's caches. As many as a part's.
+/// Most entries of a transposed group, as many as a part's: larger ones leave the processor's caches.
 const GROUP_ENTRIES: u64 = PART_ENTRIES;
-/// Bytes of a transposed entry: region and weight.
+/// Region and weight.
 const BYTES_PER_TRANSPOSED_ENTRY: u64 = size_of::<(u32, f32)>() as u64;
-/// Bytes of an entry while it is transposed: as read, and transposed.
+/// As read, and transposed.
 const BYTES_PER_ENTRY: u64 = size_of::<PackedEntry>() as u64 + BYTES_PER_TRANSPOSED_ENTRY;
-/// Bytes of a Gaussian: start, total weight, mean length, index.
+/// Start, total weight, mean length, index.
 const BYTES_PER_GAUSSIAN: u64 = (size_of::<u64>() + 3 * size_of::<f32>()) as u64;
 
-/// Consecutive Gaussians of a cell: all of them, unless they have very many entries.
+/// Consecutive Gaussians of a cell: all, unless they have very many entries.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Part {
     pub cell_id: u32,
     pub number: u32,
-    /// Its Gaussians, by their index within the cell.
+    /// Indices within the cell.
     pub(crate) locals: Range<usize>,
     pub n_entries: u64,
-    /// Its slices, numbered over the whole scene.
+    /// Numbered over the whole scene.
     pub(super) slices: Range<usize>,
 }
 
 impl Part {
-    /// Returns the scene indices of the part's Gaussians.
+    /// Scene indices of the part's Gaussians.
     pub fn gaussians<'a>(&self, split: &'a CellSplit) -> &'a [u32] {
         &split.cells[self.cell_id as usize].gaussians[self.locals.clone()]
     }
 }
 
-/// The contributions of a part by Gaussian, in canonical order: views by name, then regions.
+/// A part's contributions by Gaussian, in canonical order: views by name, then regions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PartContributions {
     pub part: Part,
-    /// `[N + 1]`: where each Gaussian's entries start.
+    /// `[N + 1]`: start of each Gaussian's entries.
     pub starts: Vec<u64>,
-    /// Region of each entry, numbered over the whole scene.
+    /// By entry, numbered over the whole scene.
     pub regions: Vec<u32>,
     pub weights: Vec<f32>,
     /// `[N]`: `Σ_r a(k, r) n_r`, the evidence.
@@ -77,7 +76,7 @@ impl PartContributions {
     }
 }
 
-/// A view's file, and the place of its regions and runs in the whole scene.
+/// A view's file, and the position of its regions and runs in the scene.
 #[derive(Debug)]
 pub(super) struct IndexedView {
     pub(super) file: ContributionFile,
@@ -87,26 +86,26 @@ pub(super) struct IndexedView {
     pub(super) n_masks: usize,
 }
 
-/// The files of all views, in the order of the views' names.
+/// Ordered by the views' names.
 pub struct ContributionIndex {
     pub(super) views: Vec<IndexedView>,
     pub(super) parts: Vec<Part>,
-    /// The Gaussians of each slice, by their index within its cell.
+    /// Gaussians of each slice: indices within its cell.
     pub(super) locals_of_slice: Vec<Range<usize>>,
-    /// The transposed parts, once a pass has read them and the budget holds them.
+    /// Transposed parts, if a pass has read them and the budget holds them.
     pub(super) kept: OnceLock<Vec<PartContributions>>,
 }
 
-/// The entries of a group of parts, in the order of the files.
+/// Entries of a group of parts, in file order.
 pub struct RawGroup {
     pub(super) parts: Range<usize>,
-    /// Of each view: its runs, and their entries.
+    /// By view: its runs, and their entries.
     pub(super) views: Vec<(Range<usize>, Vec<PackedEntry>)>,
 }
 
 impl ContributionIndex {
-    /// Opens the files of all views, in the order of the views' names, and collects their regions.
-    /// `n_gaussians_of_cell`: number of Gaussians of each cell of the scene.
+    /// Opens the files of all views, ordered by name, and collects their regions.
+    /// `n_gaussians_of_cell`: by cell of the scene.
     pub fn open(
         paths: &[PathBuf],
         dim: usize,
@@ -134,7 +133,7 @@ impl ContributionIndex {
         Ok((Self::of_files(files, n_gaussians_of_cell, part_entries)?, table))
     }
 
-    /// Makes the index of opened files: each with its first region and its number of masks.
+    /// Takes opened files, each with its first region and its number of masks.
     pub(super) fn of_files(
         files: Vec<(ContributionFile, u32, usize)>,
         n_gaussians_of_cell: &[usize],
@@ -175,7 +174,7 @@ impl ContributionIndex {
         Ok(Self { views, parts, locals_of_slice, kept })
     }
 
-    /// Returns the parts, ascending by cell and within it.
+    /// Ascending by cell and within it.
     pub fn parts(&self) -> &[Part] {
         &self.parts
     }
@@ -184,7 +183,7 @@ impl ContributionIndex {
         self.parts.iter().map(|part| part.n_entries).sum()
     }
 
-    /// Returns the first region of each view, in the order of their names.
+    /// First region of each view, ordered by name.
     pub(crate) fn first_regions(&self) -> Vec<u32> {
         self.views.iter().map(|view| view.first_region).collect()
     }
@@ -211,7 +210,7 @@ impl ContributionIndex {
         memory.reserve(Phase::Always, "the index of contributions", self.len_bytes());
     }
 
-    /// Returns the bytes that the largest part takes while it is transposed: the smallest budget.
+    /// Bytes of the largest part while it is transposed: the smallest budget.
     pub(crate) fn largest_part_bytes(&self) -> u64 {
         self.parts.iter().map(part_bytes).max().unwrap_or(0)
     }
@@ -223,8 +222,8 @@ impl ContributionIndex {
         self.parts.iter().map(of_part).sum()
     }
 
-    /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part. `n_largest`: how
-    /// many of the largest parts a group may hold where the budget allows more.
+    /// Groups parts to at most `budget_bytes` each, or a single part. `n_largest`: how many of the largest parts a
+    /// group may hold if the budget allows more.
     pub fn groups(&self, budget_bytes: u64, n_largest: u64) -> Vec<Range<usize>> {
         let max_entries = GROUP_ENTRIES.saturating_mul(n_largest);
         let mut groups: Vec<Range<usize>> = Vec::new();
@@ -276,7 +275,7 @@ fn part_bytes(part: &Part) -> u64 {
     part.n_entries * BYTES_PER_ENTRY + part.locals.len() as u64 * BYTES_PER_GAUSSIAN
 }
 
-/// Cuts a cell's slices into parts of at most `max_entries`, or of a single slice.
+/// Cuts a cell's slices into parts of at most `max_entries`, or of one slice.
 fn cut_into_parts(
     cell_id: u32,
     slices: Range<usize>,

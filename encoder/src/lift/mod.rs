@@ -9,8 +9,8 @@
 //! ```
 //!
 //! so the field stays factorised: a sparse matrix of contributions times a small matrix of region vectors.
-//! Contributions are summed in one canonical order (views by name, then regions), whatever order, thread or
-//! process made them: the result is the same bit for bit.
+//! Contributions are summed in one canonical order (views by name, then regions), whatever made them, so the result
+//! is the same bit for bit.
 
 mod contributions;
 mod embeddings;

@@ -20,9 +20,9 @@ pub(crate) struct SceneContributions<'a> {
     pub gaussians: &'a Gaussians,
     pub split: &'a CellSplit,
     pub standing: &'a Standing,
-    /// Each view's masks, in the order of the index.
+    /// Masks of each view, in the index's order.
     pub photos: &'a [Photo],
-    /// Bytes for the contributions of a group of parts.
+    /// Budget for the contributions of a group of parts.
     pub(crate) group_bytes: u64,
     pub cancel: &'a AtomicBool,
 }
@@ -35,7 +35,7 @@ impl SceneContributions<'_> {
         }
     }
 
-    /// Calls `work` with each part, on all threads, and `merge` with the results, in the order of the parts.
+    /// Calls `work` for each part on all threads, and `merge` with the results in the order of parts.
     pub(super) fn visit<T: Send>(
         &self,
         table: &RegionTable,
@@ -51,37 +51,36 @@ impl SceneContributions<'_> {
     }
 }
 
-/// One pass over the transposed contributions, group by group in the order of [`ContributionIndex::parts`].
+/// A pass over transposed contributions, by group, in the order of [`ContributionIndex::parts`].
 pub(super) struct TransposedGroups<'a> {
     index: &'a ContributionIndex,
     table: &'a RegionTable,
-    /// Parts to be read or copied.
     groups: std::vec::IntoIter<Range<usize>>,
     source: Source<'a>,
 }
 
 enum Source<'a> {
     Files {
-        /// Copies of all parts so far, if they are to be kept.
+        /// Copies of the parts so far, if they are to be kept.
         kept: Option<Vec<PartContributions>>,
     },
     Memory {
         parts: &'a [PartContributions],
-        /// `[n_regions]`: summed weight of each region's masks.
+        /// `[n_regions]`: summed weight of the region's masks.
         mask_counts: Vec<f32>,
     },
 }
 
 impl ContributionIndex {
-    /// Returns what passes want of a budget: enough to keep all parts, if that is in the budget, else half.
+    /// Budget of a pass: enough to keep all parts if that fits, else half.
     pub(crate) fn budget_bytes(&self, budget_bytes: u64) -> u64 {
         let to_keep_bytes = self.kept_bytes().saturating_add(self.largest_part_bytes()).saturating_mul(2);
         let wanted_bytes = if to_keep_bytes <= budget_bytes { to_keep_bytes } else { budget_bytes / 2 };
         wanted_bytes.max(self.largest_part_bytes())
     }
 
-    /// Starts a pass that takes at most `budget_bytes`, or what the largest part needs. Total weights follow the
-    /// table's present weights of masks. A group is what all threads work on at a time.
+    /// Starts a pass within `budget_bytes`, or the largest part's need. Total weights follow the table's present
+    /// weights of masks. A group is what all threads work on at a time.
     pub(super) fn transposed_groups<'a>(
         &'a self,
         table: &'a RegionTable,
@@ -95,8 +94,7 @@ impl ContributionIndex {
                 (self.groups(for_groups, n_threads), Source::Memory { parts, mask_counts })
             }
             None => {
-                // Half the budget: refinement and objects build lists of their own, which also grow with the
-                // entries.
+                // Half the budget: refinement and objects build lists of their own, which also grow with the entries.
                 let keeps = self.kept_bytes().saturating_add(self.largest_part_bytes()) <= budget_bytes / 2;
                 let for_groups = if keeps { budget_bytes - self.kept_bytes() } else { budget_bytes };
                 let kept = keeps.then(|| Vec::with_capacity(self.parts().len()));
@@ -106,7 +104,7 @@ impl ContributionIndex {
         TransposedGroups { index: self, table, groups: groups.into_iter(), source }
     }
 
-    /// Starts a pass as [`Self::transposed_groups`] does, which hands out one part at a time.
+    /// Like [`Self::transposed_groups`], one part at a time.
     pub(crate) fn transposed_parts<'a>(
         &'a self,
         table: &'a RegionTable,
@@ -141,7 +139,7 @@ impl Iterator for TransposedGroups<'_> {
             Source::Files { kept } => {
                 let Some(group) = group else {
                     if let Some(kept) = kept.take() {
-                        // Another pass may have kept them meanwhile: they are the same.
+                        // Another pass may have kept the same meanwhile.
                         let _ = index.kept.set(kept);
                     }
                     return None;
@@ -158,7 +156,7 @@ impl Iterator for TransposedGroups<'_> {
     }
 }
 
-/// Computes total weights, in the order in which transposing adds them: the bits are the same.
+/// Total weights, summed in the order of transposing: the bits are the same.
 fn weigh(part: &mut PartContributions, mask_counts: &[f32]) {
     let PartContributions { starts, regions, weights, total_weights, .. } = part;
     total_weights.par_iter_mut().zip(starts.par_windows(2)).for_each(|(total, at)| {

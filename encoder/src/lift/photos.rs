@@ -12,7 +12,6 @@ use crate::masks::{BoxPx, Mask};
 const MAGIC: [u8; 8] = *b"SLAGMBOX";
 const VERSION: u32 = 2;
 
-/// The masks of a view's photo.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Photo {
     pub name: String,
@@ -22,23 +21,22 @@ pub struct Photo {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 pub struct MaskOutline {
-    /// Box, pixels of the undistorted photo: x0, y0, x1, y1, the last two exclusive.
+    /// Pixels of the undistorted photo: x0, y0, x1, y1, the last two exclusive.
     pub box_px: [u32; 4],
-    /// Length of outline on the photo's edge, pixels.
+    /// Outline on the photo's edge, pixels.
     pub(crate) cut_px: u32,
-    /// Coarseness, as of [`Mask::level`].
+    /// As of [`Mask::level`].
     pub level: u32,
 }
 
 impl MaskOutline {
-    /// Returns the outline of a mask of a photo of `width_px` x `height_px`. `valid`: the pixels that undistortion
-    /// filled; `None` if all.
+    /// `valid`: pixels that undistortion filled; `None` if all.
     pub fn of(mask: &Mask, width_px: u32, height_px: u32, valid: Option<&[bool]>) -> Self {
         let BoxPx { x0, y0, x1, y1 } = mask.box_px;
         let is_there = |x: u32, y: u32| {
             x < width_px && y < height_px && valid.is_none_or(|valid| valid[(y * width_px + x) as usize])
         };
-        // One less than 0 wraps to more than any photo's width.
+        // 0 - 1 wraps beyond any photo's width.
         let n_cut = |x: u32, y: u32| {
             let beside = [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)];
             beside.into_iter().filter(|(x, y)| !is_there(*x, *y)).count()
@@ -50,15 +48,14 @@ impl MaskOutline {
         Self { box_px: [x0, y0, x1, y1], cut_px, level: mask.level.into() }
     }
 
-    /// Returns 1 - truncation, 0 to 1: the share of the outline that the photo's edge does not cut off. The box's
-    /// perimeter stands for the outline's length, because a ragged outline is no longer for it.
+    /// 1 - truncation, 0 to 1: share of the outline that the photo's edge does not cut off. The box's perimeter stands
+    /// for the outline's length, which raggedness would increase.
     pub(crate) fn uncut_share(&self) -> f32 {
         let [x0, y0, x1, y1] = self.box_px.map(f64::from);
         (1.0 - f64::from(self.cut_px) / (2.0 * (x1 - x0 + y1 - y0))).max(0.0) as f32
     }
 }
 
-/// Writes the outlines of a view's masks durably.
 pub(crate) fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<(), ContributionError> {
     Ok(slag_common::durable::write(path, &outlines_to_bytes(outlines)?)?)
 }
@@ -92,22 +89,22 @@ mod tests {
         Mask { level: 2, ..Mask::within(BoxPx { x0, y0, x1, y1 }, |x, y| !hole(x, y)) }
     }
 
-    /// Computed by hand: outlines on the photo's edge, and along pixels that undistortion left empty.
+    /// By hand: outlines on the photo's edge, and along pixels that undistortion left empty.
     #[test]
     fn the_photos_edge_cuts_off_what_touches_it() {
         let of = |mask: &Mask, valid| MaskOutline::of(mask, 20, 10, valid);
         let inner = of(&mask([3, 2, 9, 8], |_, _| false), None);
         assert_eq!(inner, MaskOutline { box_px: [3, 2, 9, 8], cut_px: 0, level: 2 });
         assert_eq!(inner.uncut_share(), 1.0);
-        // 4 of the left, 5 of the lower edge.
+        // 4 of the left edge, 5 of the lower one.
         let corner = of(&mask([0, 6, 5, 10], |_, _| false), None);
         assert_eq!((corner.cut_px, corner.uncut_share()), (9, 0.5));
-        // It touches the right edge with two pixels of its five rows.
+        // Two pixels of its five rows touch the right edge.
         let tip = of(&mask([14, 2, 20, 7], |x, y| x == 19 && !(3..5).contains(&y)), None);
         assert_eq!((tip.cut_px, tip.uncut_share()), (2, 10.0_f32 / 11.0));
         let whole_photo = of(&mask([0, 0, 20, 10], |_, _| false), None);
         assert_eq!((whole_photo.cut_px, whole_photo.uncut_share()), (60, 0.0));
-        // Columns 0 to 2 are empty: the mask beside them is cut along its 6 rows.
+        // Columns 0 to 2 are empty, so the mask beside them is cut along its 6 rows.
         let valid: Vec<bool> = (0..200).map(|at| at % 20 > 2).collect();
         assert_eq!(of(&mask([3, 2, 9, 8], |_, _| false), Some(&valid)).cut_px, 6);
         assert_eq!(of(&mask([4, 2, 9, 8], |_, _| false), Some(&valid)).cut_px, 0);

@@ -8,14 +8,13 @@ use crate::store::{StoreError, StoreReader};
 
 pub(crate) const EXTRA_REGIONS: &str = "regions";
 
-/// Name of the record ([`super::Aggregation`], JSON) of the refinements; absent for the plain average.
+/// Record of the refinements ([`super::Aggregation`], JSON); absent for the plain average.
 pub(crate) const EXTRA_AGGREGATION: &str = "aggregation";
 
 pub(crate) fn extra_field(cell_id: u32, part: u32) -> String {
     format!("field/{cell_id}/{part}")
 }
 
-/// Reads the full-precision field of a published cell of `n_gaussians`.
 pub fn read_field(
     reader: &StoreReader,
     cell_id: u32,

@@ -2,9 +2,9 @@
 //! Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004) of the Gaussians' nearest-neighbour
 //! graph.
 //!
-//! The length of an edge is the difference of its ends in colour, in the direction of their thinnest axes and, if
-//! known, in their embeddings. Distance only decides which Gaussians are neighbours. What stands on the ground has no
-//! edge to it, nor to other things: a cone of ten Gaussians would be joined to the road.
+//! An edge's length is the difference of its ends in colour, in the direction of their thinnest axes and, if known, in
+//! their embeddings; distance only decides who is a neighbour. What stands on the ground has no edge to the ground nor
+//! to other things: a cone of ten Gaussians would be joined to the road.
 
 use rayon::prelude::*;
 use slag_common::Gaussians;
@@ -15,24 +15,23 @@ use slag_math::graph_segmentation::Components;
 use slag_math::nearest::{self, Neighbours};
 use slag_math::union_find::{NOT_NUMBERED, Numbering};
 
-/// The superpoint of a Gaussian that cannot be drawn.
+/// Marks Gaussians that cannot be drawn.
 pub(crate) const NO_SUPERPOINT: u32 = NOT_NUMBERED;
 
-/// The differences that edges measure, and the size of superpoints.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct SuperpointSettings {
-    /// Nearest neighbours of a Gaussian that get an edge.
+    /// Nearest neighbours that get an edge.
     pub(crate) n_neighbours: usize,
-    /// Length of an edge from black to white, over the square root of 3.
+    /// Edge length from black to white, over the square root of 3.
     pub colour: f32,
-    /// Length of a right angle between thinnest axes.
+    /// Edge length of a right angle between thinnest axes.
     pub normal: f32,
-    /// Length of a right angle between sketches of embeddings.
+    /// Edge length of a right angle between sketches of embeddings.
     pub field: f32,
-    /// Scale of observation k: an edge joins two components if it is at most each component's longest inner edge
-    /// plus k over its size.
+    /// Scale of observation k: an edge joins two components if it is at most each one's longest inner edge plus k over
+    /// its size.
     pub scale: f32,
-    /// Smaller components are joined to their most similar neighbour.
+    /// Smaller components join their most similar neighbour.
     pub(crate) min_gaussians: u32,
 }
 
@@ -44,23 +43,21 @@ impl Default for SuperpointSettings {
 }
 
 impl SuperpointSettings {
-    /// Returns settings for larger superpoints of the same edges: about the sides of a thing, where the default
-    /// ones are patches.
+    /// Larger superpoints of the same edges: about the sides of a thing, where the default ones are patches.
     pub fn coarse() -> Self {
         Self { scale: 20.0, min_gaussians: 60, ..Self::default() }
     }
 }
 
-/// A partition of a scene's Gaussians.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Superpoints {
-    /// `[N]`: the superpoint of each Gaussian, [`NO_SUPERPOINT`] where it cannot be drawn.
+    /// `[N]`: [`NO_SUPERPOINT`] for Gaussians that cannot be drawn.
     pub(crate) of_gaussian: Vec<u32>,
-    /// Number of superpoints; they are numbered in the order of their first Gaussians.
+    /// Superpoints are numbered by their first Gaussians.
     pub n: usize,
 }
 
-/// Short vectors that differ as embeddings do, of any common scale; zeros where unknown.
+/// Short vectors that differ as embeddings do, at any common scale; zeros where unknown.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sketches<'a> {
     pub width: usize,
@@ -69,7 +66,7 @@ pub(crate) struct Sketches<'a> {
 }
 
 impl Sketches<'_> {
-    /// Returns 1 minus the cosine of two sketches; 0 if one is unknown.
+    /// 1 minus the cosine; 0 if one is unknown.
     fn difference(&self, a: usize, b: usize) -> f32 {
         let [a, b] = [a, b].map(|i| &self.values[i * self.width..][..self.width]);
         let product =
@@ -82,13 +79,11 @@ impl Sketches<'_> {
     }
 }
 
-/// Gaussians whose edges a thread measures at once.
 const GAUSSIANS_PER_TASK: usize = 1 << 12;
 
-/// An edge; ascending by length, then by ends.
+/// Ascending by length, then by ends.
 type Edge = (u32, u32, u32);
 
-/// A scene's nearest-neighbour graph.
 #[derive(Debug)]
 pub struct Graph {
     n_gaussians: usize,
@@ -121,13 +116,13 @@ impl Graph {
             if let Some(sketches) = sketches {
                 length += settings.field * sketches.difference(a as usize, b as usize);
             }
-            // Lengths are not negative, so their bits have the same order.
+            // Bits of non-negative lengths have the same order.
             (length.to_bits(), a, b)
         };
         let edges_of = |chunk: &[u32], first: usize| {
             let mut edges = Vec::with_capacity(chunk.len() * settings.n_neighbours);
             for i in (first as u32..).take(chunk.len()) {
-                // Two that are each other's neighbours have one edge.
+                // Mutual neighbours have one edge.
                 let is_new = |j: &&u32| i < **j || !neighbours.of(**j).contains(&i);
                 let is_of_thing = |j: &&u32| things[i as usize] == things[**j as usize];
                 let new = neighbours.of(i).iter().filter(is_new).filter(is_of_thing);
@@ -148,7 +143,7 @@ impl Graph {
         Self { n_gaussians: scene.len(), usable, edges }
     }
 
-    /// Partitions the scene. `settings`: scale and smallest size.
+    /// `settings`: scale and smallest size.
     pub(crate) fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
         let mut components = Components::new(self.n_gaussians, settings.scale);
         let edge = |(length, a, b): &Edge| (*a, *b, f32::from_bits(*length));
@@ -167,13 +162,12 @@ impl Superpoints {
         sizes
     }
 
-    /// Partitions a scene by colour and shape. The result does not depend on threads.
+    /// Uses colour and shape. The result does not depend on threads.
     pub fn new(scene: &Gaussians, standing: &Standing, settings: &SuperpointSettings) -> Self {
         Graph::new(scene, standing, None, settings).superpoints(settings)
     }
 
-    /// Returns the bytes that partitioning `n_gaussians` takes, at `n_scales` at once: neighbours while they are
-    /// searched, then with the edges and what joins them.
+    /// Bytes to partition `n_gaussians` at `n_scales` at once: neighbours during the search, then with edges and joins.
     pub(crate) fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
         let n = settings.n_neighbours;
         let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);
@@ -183,7 +177,7 @@ impl Superpoints {
     }
 }
 
-/// What the edges of a Gaussian compare, but for its embedding.
+/// What a Gaussian's edges compare, except embeddings.
 #[derive(Clone, Copy)]
 struct Look {
     colour: [f32; 3],
@@ -202,7 +196,7 @@ impl Look {
     }
 }
 
-/// Returns a Gaussian's thinnest axis in the world: the normal, where it lies on a surface.
+/// Thinnest axis in the world: the normal of a Gaussian on a surface.
 fn thinnest_axis([w, x, y, z]: [f32; 4], scales: [f32; 3]) -> [f32; 3] {
     let thinnest = (0..3).min_by(|a, b| scales[*a].total_cmp(&scales[*b])).unwrap_or(0);
     match thinnest {

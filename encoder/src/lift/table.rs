@@ -1,10 +1,10 @@
 //! The regions of all views: which masks cover each, and the masks' vectors.
 //!
-//! `V_r`, the sum of a region's mask vectors, is not stored: a mask has several regions, and a few additions
-//! compute the sum when it is needed. So a scene's table is hardly larger than its mask vectors.
+//! `V_r`, the sum of a region's mask vectors, is not stored: a mask has several regions, and a few additions compute it
+//! when needed. So a scene's table is hardly larger than its mask vectors.
 //!
-//! In the plain average every mask has weight 1. [`RegionTable::set_mask_weights`] sets other weights, `V_r = Σ_j
-//! m_j e_j` and `n_r = Σ_j m_j`. [`RegionTable::append_mixture`] adds a region of no view: any mixture of masks.
+//! In the plain average every mask has weight 1; [`RegionTable::set_mask_weights`] sets others, `V_r = Σ_j m_j e_j` and
+//! `n_r = Σ_j m_j`. [`RegionTable::append_mixture`] adds a region of no view: any mixture of masks.
 
 use std::io::{self, Write};
 use std::ops::Range;
@@ -20,7 +20,7 @@ use crate::memory::{MemoryPlan, Phase};
 const MAGIC: [u8; 8] = *b"SLAGREGN";
 const VERSION: u32 = 2;
 
-/// Returns the number of the first of `n_more` regions or masks that follow `n`.
+/// Number of the first of `n_more` regions or masks after `n`.
 fn first_number(n: usize, n_more: usize, what: &'static str) -> Result<u32, ContributionError> {
     let fits = n.checked_add(n_more).is_some_and(|end| end <= MAX_IN_ALL);
     if fits { Ok(n as u32) } else { Err(ContributionError::TooManyInAll { what }) }
@@ -31,18 +31,17 @@ pub struct RegionTable {
     dim: usize,
     /// `[n_masks][dim]`, unit.
     mask_vectors: Vec<f32>,
-    /// `[n + 1]`: where each region's masks start.
+    /// `[n + 1]`: start of each region's masks.
     starts: Vec<u64>,
-    /// Masks of each region, numbered over the whole scene.
+    /// By region, numbered over the whole scene.
     masks: Vec<u32>,
-    /// Weight of each of these; empty if all are 1.
+    /// Weights of these; empty if all are 1.
     shares: Vec<f32>,
-    /// `[n_masks]`: level of each mask, as of [`Mask::level`]; empty if there is one level.
+    /// `[n_masks]`: as of [`Mask::level`]; empty for a single level.
     levels: Vec<u8>,
 }
 
 impl RegionTable {
-    /// Returns a table without regions, for vectors of `dim` components.
     pub fn new(dim: usize) -> Self {
         Self {
             dim,
@@ -79,8 +78,8 @@ impl RegionTable {
         memory.reserve(Phase::Always, "masks and regions of all views", self.len_bytes());
     }
 
-    /// Appends a view's regions and returns the number of the first; `mask_vectors` is `[n][dim]`,
-    /// `masks_of_region` refers to it.
+    /// Appends a view's regions and returns the first one's number; `mask_vectors` is `[n][dim]`, and `masks_of_region`
+    /// refers to it.
     ///
     /// # Errors
     /// [`ContributionError::TooManyInAll`] if regions or masks can no longer be numbered; the table is then as it was.
@@ -92,7 +91,7 @@ impl RegionTable {
         let first = first_number(self.len(), masks_of_region.len(), "regions")?;
         let n_masks = mask_vectors.len() / self.dim;
         let first_mask = first_number(self.n_masks(), n_masks, "masks")?;
-        // Exact: doubling would take twice the memory of the budget's estimate.
+        // Exact: doubling would exceed the budget's estimate.
         self.mask_vectors.reserve_exact(mask_vectors.len());
         self.mask_vectors.extend(mask_vectors);
         for masks in masks_of_region {
@@ -105,7 +104,7 @@ impl RegionTable {
         Ok(first)
     }
 
-    /// Sets the weight of each mask. `weights`: `[n_masks]`, finite, not negative.
+    /// `weights`: `[n_masks]`, finite, not negative.
     pub(crate) fn set_mask_weights(&mut self, weights: &[f32]) {
         self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
     }
@@ -114,7 +113,7 @@ impl RegionTable {
         self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
     }
 
-    /// Appends a region that is a mixture of masks, `(mask, weight)`, and returns its number.
+    /// Appends a mixture of masks, `(mask, weight)`, as a region; returns its number.
     pub(super) fn append_mixture(&mut self, mixture: &[(u32, f32)]) -> Result<u32, ContributionError> {
         let number = first_number(self.len(), 1, "regions")?;
         self.shares.resize(self.masks.len(), 1.0);
@@ -132,12 +131,12 @@ impl RegionTable {
         self.starts[region] as usize..self.starts[region + 1] as usize
     }
 
-    /// Returns the masks of a region, whatever their weights.
+    /// Masks of a region, whatever their weights.
     pub(crate) fn all_masks_of(&self, region: usize) -> &[u32] {
         &self.masks[self.listed(region)]
     }
 
-    /// Returns whether a region has only masks that are no thing's: of a view, no fillers and others overlap.
+    /// Whether only fillers cover a region: in one view, fillers and other masks do not overlap.
     pub(crate) fn is_filled(&self, region: usize) -> bool {
         let level = |mask: &u32| self.levels.get(*mask as usize).copied().unwrap_or_default();
         self.all_masks_of(region).iter().all(|mask| level(mask) == Mask::FILLER)
@@ -151,13 +150,12 @@ impl RegionTable {
         self.masks[listed].iter().enumerate().map(move |(i, mask)| (*mask, share(i)))
     }
 
-    /// Returns the summed weight of each region's masks: their number, if all weights are 1.
+    /// Summed weight of each region's masks: their number if all weights are 1.
     pub(super) fn mask_counts(&self, regions: Range<usize>) -> Vec<f32> {
         regions.map(|region| self.masks_of(region).map(|(_, share)| share).sum()).collect()
     }
 
-    /// Writes components `from..from + out.len()` of `V_r`; inlined, to be compiled for the caller's instruction
-    /// set.
+    /// Writes components `from..from + out.len()` of `V_r`; inlined for the caller's instruction set.
     #[inline(always)]
     pub(super) fn components(&self, region: usize, from: usize, out: &mut [f32]) {
         out.fill(0.0);
@@ -168,7 +166,7 @@ impl RegionTable {
         }
     }
 
-    /// Returns `q · V_r` for every region.
+    /// `q · V_r` for every region.
     pub fn scores(&self, query: &[f32]) -> Vec<f32> {
         let vectors = self.mask_vectors.par_chunks_exact(self.dim);
         let of_masks: Vec<f32> = vectors.map(|vector| slag_math::dot(vector, query)).collect();
@@ -176,7 +174,6 @@ impl RegionTable {
         (0..self.len()).into_par_iter().map(score).collect()
     }
 
-    /// Writes the file form.
     pub fn write(&self, out: impl Write) -> io::Result<()> {
         let header = [self.dim, self.len(), self.n_masks(), self.masks.len()].map(|n| n as u64);
         let mut sections = vec![
@@ -194,7 +191,6 @@ impl RegionTable {
         container::write(out, MAGIC, VERSION, &sections)
     }
 
-    /// Reads the file form.
     pub fn from_bytes(bytes: &AlignedBytes) -> Result<Self, ContainerError> {
         let layout = Layout::check(bytes, MAGIC, VERSION)?;
         let [dim, n, n_masks, n_listed] =
@@ -225,7 +221,7 @@ impl RegionTable {
     }
 }
 
-/// Returns whether values ascend from 0 to `end`, as the starts of `starts.len() - 1` rows do.
+/// Whether values ascend from 0 to `end`, as starts of `starts.len() - 1` rows do.
 pub(super) fn are_starts(starts: &[u64], end: usize) -> bool {
     starts.first() == Some(&0) && starts.is_sorted() && starts.last() == Some(&(end as u64))
 }
@@ -234,7 +230,7 @@ pub(super) fn are_starts(starts: &[u64], end: usize) -> bool {
 mod tests {
     use super::*;
 
-    /// Numbers of 32 bits, of which the last marks what has none: a table that large cannot be made here.
+    /// The last 32-bit number marks "none"; a table that large cannot be made here.
     #[test]
     fn regions_and_masks_that_cannot_be_numbered_are_refused() {
         let number = |n, n_more| first_number(n, n_more, "regions").ok();

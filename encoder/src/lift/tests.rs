@@ -8,7 +8,6 @@ use super::*;
 use slag_math::dot;
 use slag_math::random::mix64;
 
-/// Files of contributions in a folder, and what was opened of them.
 pub(super) struct Scene {
     pub(super) index: ContributionIndex,
     pub(super) table: RegionTable,
@@ -16,7 +15,7 @@ pub(super) struct Scene {
     _dir: tempfile::TempDir,
 }
 
-/// Writes views to files in the order given and opens them, with parts of at most `part_entries`.
+/// Writes views in the given order and opens them, with parts of at most `part_entries`.
 pub(super) fn open(views: &[ViewContributions], dim: usize, n_of_cell: &[usize], part_entries: u64) -> Scene {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let path = |(i, view): (usize, &ViewContributions)| {
@@ -29,7 +28,7 @@ pub(super) fn open(views: &[ViewContributions], dim: usize, n_of_cell: &[usize],
     Scene { index, table, paths, _dir: dir }
 }
 
-/// A scene of one cell: `n_views` views of 12 masks and 30 regions see two of three Gaussians.
+/// One cell: `n_views` views of 12 masks and 30 regions see two of three Gaussians.
 pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
     let random = |seed: u64| mix64(seed) >> 20;
     let view = |view: u64| {
@@ -56,7 +55,7 @@ fn transpose(scene: &Scene, budget_bytes: u64) -> Vec<PartContributions> {
     scene.index.transposed_parts(&scene.table, budget_bytes).collect::<Result<_, _>>().expect("transposes")
 }
 
-/// The paper's equation in float64, mask by mask: no regions, no sparse rows.
+/// The paper's equation in float64, mask by mask, without regions or sparse rows.
 fn oracle(cell: u32, k: u32, views: &[ViewContributions], dim: usize) -> (f64, Option<Vec<f64>>) {
     let mut sum = vec![0.0f64; dim];
     let mut total = 0.0f64;
@@ -75,7 +74,7 @@ fn oracle(cell: u32, k: u32, views: &[ViewContributions], dim: usize) -> (f64, O
     (total, is_clear.then(|| sum.iter().map(|c| c / length).collect()))
 }
 
-/// Cells of which one has three slices, the last of them short; contributions crowd around their ends.
+/// One cell has three slices, the last of them short; contributions crowd around their ends.
 const N_OF_CELL: [usize; 3] = [9, 2 * GAUSSIANS_PER_SLICE + 2, 1];
 const LOCALS: [&[u32]; 3] = [&[0, 3, 8], &[0, 1, 4095, 4096, 4097, 8191, 8192, 8193], &[0]];
 
@@ -121,7 +120,7 @@ proptest! {
         let mut next = (0, 0);
         for contributions in &parts {
             let part = &contributions.part;
-            // Parts follow each other without a gap, and end at the ends of cells.
+            // Parts have no gaps and end at the ends of cells.
             prop_assert_eq!((part.cell_id as usize, part.locals.start), next);
             next = if part.locals.end == N_OF_CELL[next.0] { (next.0 + 1, 0) } else { (next.0, part.locals.end) };
             prop_assert!(part.n_entries <= part_entries || part.locals.len() <= GAUSSIANS_PER_SLICE);
@@ -178,7 +177,6 @@ proptest! {
     }
 }
 
-/// A cell's parts, read one after the other, are the cell.
 #[test]
 fn parts_of_a_cell_make_the_cell() {
     let whole = scene_of(5, 10_000, 4);
@@ -196,8 +194,7 @@ fn parts_of_a_cell_make_the_cell() {
     assert_eq!(joined, field(transpose(&whole, 0).remove(0)));
 }
 
-/// Where the budget holds all parts, only the first pass reads the files; total weights follow the table all the
-/// same.
+/// If the budget holds all parts, only the first pass reads the files; total weights still follow the table.
 #[test]
 fn parts_that_fit_the_budget_are_read_once() {
     let scene = scene_of(5, 10_000, 4);

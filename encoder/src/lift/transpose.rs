@@ -8,14 +8,12 @@ use super::contributions::{ContributionError, GAUSSIANS_PER_SLICE, PackedEntry};
 use super::index::{ContributionIndex, IndexedView, PartContributions, RawGroup};
 use super::table::RegionTable;
 
-/// A slice's entries in one view.
 #[derive(Clone, Copy)]
 struct SliceRun<'a> {
     view: usize,
     entries: &'a [PackedEntry],
 }
 
-/// A slice to be transposed, and the places of its results.
 struct SliceTask<'a> {
     runs: Vec<SliceRun<'a>>,
     starts: &'a mut [u64],
@@ -26,7 +24,6 @@ struct SliceTask<'a> {
 }
 
 impl ContributionIndex {
-    /// Transposes the entries of a group from the views' order to the Gaussians'.
     pub fn transpose(
         &self,
         raw: &RawGroup,
@@ -73,7 +70,7 @@ impl ContributionIndex {
         Ok(contributions)
     }
 
-    /// A counting sort by Gaussian that keeps the order of the views.
+    /// Counting sort by Gaussian that keeps the views' order.
     fn transpose_slice(
         &self,
         task: SliceTask<'_>,

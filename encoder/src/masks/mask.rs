@@ -2,19 +2,15 @@
 
 use super::bits::Bits;
 
-/// Label of a pixel outside all masks, in [`RegionMap::region_of_pixel`](super::RegionMap::region_of_pixel) and in label images.
+/// Pixels outside all masks, in [`RegionMap::region_of_pixel`](super::RegionMap::region_of_pixel) and label images.
 pub const NO_REGION: u32 = u32::MAX;
 
 /// A box in pixels: `x0 <= x < x1`, `y0 <= y < y1`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BoxPx {
-    /// Left, inclusive.
     pub x0: u32,
-    /// Top, inclusive.
     pub y0: u32,
-    /// Right, exclusive.
     pub x1: u32,
-    /// Bottom, exclusive.
     pub y1: u32,
 }
 
@@ -32,27 +28,26 @@ impl BoxPx {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mask {
     pub box_px: BoxPx,
-    /// Membership, row-major within the box.
+    /// Row-major within the box.
     pub inside: Bits,
     pub area_px: u32,
-    /// Coarseness, if the segmenter has several levels: 0 is the coarsest (whole objects); or [`Mask::FILLER`].
+    /// Coarseness, for segmenters with several levels: 0 is the coarsest (whole objects); or [`Mask::FILLER`].
     pub level: u8,
 }
 
 impl Mask {
-    /// The level of a mask that only gives pixels without any other a place: its outline is nobody's, so it says
-    /// nothing of things.
+    /// Level of a mask that only covers pixels without any other: its outline says nothing of things.
     pub(crate) const FILLER: u8 = u8::MAX;
-    /// The level of a mask of what stands on the ground: the splat's shape tells it, not the photo.
+    /// Level of a mask of a standing thing: from the splat's shape, not the photo.
     pub(crate) const STANDING: u8 = u8::MAX - 1;
 
-    /// Makes a mask of all pixels of a box, with level 0.
+    /// All pixels of a box, level 0.
     pub fn whole(box_px: BoxPx) -> Self {
         let area_px = box_px.width_px() * box_px.height_px();
         Self { box_px, inside: Bits::of(true, area_px as usize), area_px, level: 0 }
     }
 
-    /// Makes a mask of those pixels of a box that are inside, with level 0.
+    /// The pixels of a box that are inside, level 0.
     #[cfg(test)]
     pub(crate) fn within(box_px: BoxPx, is_inside: impl Fn(u32, u32) -> bool) -> Self {
         let BoxPx { x0, y0, x1, y1 } = box_px;
@@ -70,10 +65,8 @@ impl Mask {
     }
 }
 
-/// Converts a label image into one mask per label except [`NO_REGION`], in ascending order of the labels.
-///
-/// `labels`: row-major, `width_px` per row, each below `n_labels` or [`NO_REGION`]. Returns `None` if the boxes of
-/// all masks together exceed `limit_px`.
+/// Makes one mask per label except [`NO_REGION`], ascending; `None` if the boxes of all masks together exceed
+/// `limit_px`. `labels`: row-major, `width_px` per row, each below `n_labels` or [`NO_REGION`].
 pub fn masks_of_labels(
     labels: &[u32],
     width_px: u32,

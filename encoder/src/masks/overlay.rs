@@ -4,19 +4,18 @@ use image::{Rgb, RgbImage, imageops};
 
 use super::{BoxPx, Mask};
 
-/// Share of a mask's colour inside it.
+/// Share of the mask's colour inside it.
 const TINT: f32 = 0.35;
-/// Turn of the hue from one mask to the next: the golden ratio keeps neighbours in the list apart.
+/// Hue step between masks: the golden ratio keeps neighbours in the list apart.
 const HUE_STEP: f32 = 0.618_034;
 
-/// Returns the photo, at most `width_px` wide, with the masks tinted and their borders drawn, each in a colour of
-/// its own. Later masks lie over earlier ones.
+/// Draws masks over a photo, at most `width_px` wide, tinted with a border, each in its own colour; later ones on top.
 pub fn overlay(photo: &RgbImage, masks: &[Mask], width_px: u32) -> RgbImage {
     let width = width_px.min(photo.width()).max(1);
     let scale = f64::from(photo.width()) / f64::from(width);
     let height = ((f64::from(photo.height()) / scale).round() as u32).max(1);
     let mut picture = imageops::thumbnail(photo, width, height);
-    // The pixel of the photo under the middle of one of the picture's.
+    // Pixel of the photo under the middle of a pixel of the picture.
     let in_photo = |at: u32, n: u32| ((f64::from(at) + 0.5) * scale).min(f64::from(n) - 1.0) as u32;
     for (number, mask) in masks.iter().enumerate() {
         let colour = hue((number as f32 * HUE_STEP).fract());
@@ -46,7 +45,6 @@ pub fn overlay(photo: &RgbImage, masks: &[Mask], width_px: u32) -> RgbImage {
     picture
 }
 
-/// Returns a strong colour of a hue, 0 to 1.
 fn hue(hue: f32) -> [f32; 3] {
     [0.0, 2.0, 4.0].map(|shift: f32| {
         let distance = ((hue * 6.0 - shift).rem_euclid(6.0) - 3.0).abs();
@@ -64,8 +62,7 @@ mod tests {
         let box_px = BoxPx { x0: 20, y0: 8, x1: 60, y1: 32 };
         let picture = overlay(&photo, &[Mask::within(box_px, |x, y| x < 40 || y < 20)], 40);
         assert_eq!(picture.dimensions(), (40, 20));
-        // The first colour is red. By hand, in pixels of half the size: inside, on the border, in the notch,
-        // outside.
+        // The first colour is red. By hand, in half-size pixels: inside, on the border, in the notch, outside.
         assert_eq!(picture.get_pixel(15, 8).0, [154, 65, 65]);
         assert_eq!(picture.get_pixel(10, 8).0, [255, 0, 0]);
         for (x, y) in [(25, 13), (9, 8), (30, 8), (15, 3), (15, 16)] {

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use super::mask::{BoxPx, Mask};
 use super::patches;
 
-/// Returns the patches of a photo that have pixels, with their numbers, row by row. Patch `k` of `per_side` covers
-/// the pixels whose centres lie in `[k, k + 1) * width / per_side`, and the same down the photo.
+/// Patches with pixels, with their numbers, row by row. Patch `k` of `per_side` covers the pixels whose centres lie in
+/// `[k, k + 1) * width / per_side`, and the same down the photo.
 pub(crate) fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, Mask)> {
-    // The first pixel whose centre is at or after the patch's edge: ceil(k * edge / per_side - 1/2).
+    // First pixel with its centre at or after the patch's edge: ceil(k * edge / per_side - 1/2).
     let first = |k: u32, edge_px: u32| {
         let (k, edge, n) = (u64::from(k), u64::from(edge_px), u64::from(per_side.max(1)));
         (2 * k * edge).saturating_sub(n).div_ceil(2 * n) as u32
@@ -27,10 +27,9 @@ pub(crate) fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(
     patches
 }
 
-/// Returns the share of a mask's pixels in each patch where it has some, by number of the patch. Patches are those
-/// of [`patch_masks`].
+/// Share of a mask's pixels in each patch of [`patch_masks`] that has some, by number.
 pub fn shares(mask: &Mask, per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, f32)> {
-    // The patch of a pixel's centre: floor((x + 1/2) * per_side / edge).
+    // Patch of a pixel's centre: floor((x + 1/2) * per_side / edge).
     let patch = |x: u32, edge_px: u32| {
         ((2 * u64::from(x) + 1) * u64::from(per_side) / (2 * u64::from(edge_px.max(1)))) as usize
     };
@@ -48,8 +47,7 @@ pub fn shares(mask: &Mask, per_side: u32, width_px: u32, height_px: u32) -> Vec<
     counts.into_iter().map(|(patch, count)| (patch, count as f32 / n as f32)).collect()
 }
 
-/// Windows over a photo: for each size `s` those of `1/s` of its edges, half of one apart, so `(2 s - 1)^2`, row
-/// by row.
+/// Windows over a photo: for each size `s`, `1/s` of its edges and half of that apart, so `(2 s - 1)^2`, row by row.
 pub(crate) struct Windows {
     sizes: Vec<u32>,
     width_px: u32,
@@ -57,7 +55,7 @@ pub(crate) struct Windows {
 }
 
 impl Windows {
-    /// Windows of some sizes; those that a photo is too small for are left out.
+    /// Leaves out sizes that the photo is too small for.
     pub fn new(sizes: &[u8], width_px: u32, height_px: u32) -> Self {
         let fits = |size: &u32| *size > 0 && 2 * size <= width_px.min(height_px);
         Self { sizes: sizes.iter().map(|&size| u32::from(size)).filter(fits).collect(), width_px, height_px }
@@ -82,8 +80,8 @@ impl Windows {
         masks
     }
 
-    /// Returns the share of a mask in each window where it has some, by the window's number: a pixel counts for
-    /// all windows of a size that it is in, alike, and for each size alike.
+    /// Share of a mask in each window that has some, by number: a pixel counts equally for all windows of a size that
+    /// contain it, and equally for each size.
     pub fn shares(&self, mask: &Mask) -> Vec<(usize, f32)> {
         let mut shares = Vec::new();
         let mut first = 0;
@@ -91,7 +89,7 @@ impl Windows {
             let (n, per_side) = (2 * size as usize - 1, 2 * size as usize);
             let mut of_size = vec![0.0; n * n];
             for (cell, share) in patches::shares(mask, 2 * size, self.width_px, self.height_px) {
-                // A cell is half a window wide: the window that begins with it, and the one before.
+                // A cell is half a window wide, so it lies in the window that begins with it and the one before.
                 let over = |k: usize| k.saturating_sub(1)..=k.min(n - 1);
                 let (rows, columns) = (over(cell / per_side), over(cell % per_side));
                 let each = share / (rows.clone().count() * columns.clone().count()) as f32;

@@ -5,35 +5,34 @@ use std::collections::BTreeMap;
 
 use super::mask::{Mask, NO_REGION};
 
-/// The partition of a view by its masks: the pixels of a region lie in the same masks.
+/// A view's partition: the pixels of a region lie in the same masks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionMap {
     pub width_px: u32,
     pub height_px: u32,
-    /// Region of each pixel, row-major; [`NO_REGION`] outside all masks.
+    /// Row-major; [`NO_REGION`] outside all masks.
     pub region_of_pixel: Vec<u32>,
-    /// Number of regions, which are numbered in the order of a row-major scan.
+    /// Regions are numbered in the order of a row-major scan.
     pub n_regions: u32,
 }
 
-/// The class of invalid pixels, which belong to no region.
+/// Class of invalid pixels, which belong to no region.
 const INVALID: u32 = u32::MAX;
-/// The class of pixels outside all masks so far.
+/// Class of pixels outside all masks so far.
 const UNCOVERED: u32 = 0;
 
-/// A sliver has less than one part in this of the raster: 30 pixels of 640 x 480.
+/// A sliver has less than one in this many pixels of the raster: 30 of 640 x 480.
 const SLIVERS_PER_RASTER: usize = 10_000;
-/// A sliver has less than one part in this of every mask that covers it.
+/// A sliver has less than one in this many pixels of every mask that covers it.
 const SLIVERS_PER_MASK: u32 = 8;
 
-/// Divides a raster into regions, the sets of pixels that lie in the same masks.
+/// Divides a raster into regions, the sets of pixels that lie in the same masks. Returns the map, and the masks of each
+/// region as ascending indices into `masks`.
 ///
-/// `masks` belong to an image of `width_px` x `height_px`; the parts of their boxes outside the image are ignored.
-/// Each pixel centre of the raster of `target_width_px` x `target_height_px` takes the nearest image pixel.
-/// `valid`: `[height_px * width_px]`, row-major; invalid pixels belong to no region.
-///
-/// Returns the map, and the masks of each region as ascending indices into `masks`. Masks refine the partition one
-/// after the other, each within its box, so the time is proportional to the area of the boxes.
+/// `masks` belong to an image of `width_px` x `height_px`; parts of their boxes outside it are ignored. Each pixel
+/// centre of the raster of `target_width_px` x `target_height_px` takes the nearest image pixel. `valid`:
+/// `[height_px * width_px]`, row-major; invalid pixels belong to no region. Time is proportional to the area of the
+/// masks' boxes.
 ///
 /// # Panics
 /// If `valid` has another length than the image has pixels.
@@ -71,14 +70,14 @@ pub fn partition(
     number_regions(classes.of_pixel, classes.sizes.len(), masks, &columns, &rows)
 }
 
-/// Pixels by the masks so far in which they lie.
+/// Pixels by the masks that contain them so far.
 struct Classes {
     of_pixel: Vec<u32>,
     sizes: Vec<usize>,
-    /// Of each class, its pixels within the mask at hand, and the class that they get. Between masks: 0.
+    /// By class: pixels in the current mask, and the new class. 0 between masks.
     n_inside: Vec<usize>,
     split: Vec<u32>,
-    /// Pixels and classes of the mask at hand.
+    /// Of the current mask.
     pixels: Vec<usize>,
     touched: Vec<u32>,
 }
@@ -90,7 +89,6 @@ impl Classes {
         Self { of_pixel, sizes, n_inside: vec![0], split: vec![INVALID], pixels, touched }
     }
 
-    /// Splits the classes that lie in the mask in part.
     fn refine(&mut self, mask: &Mask, columns: &[u32], rows: &[u32]) {
         self.pixels.clear();
         for_each_pixel(mask, columns, rows, |pixel| {
@@ -106,8 +104,8 @@ impl Classes {
         for class in self.touched.drain(..) {
             let at = class as usize;
             let inside = std::mem::take(&mut self.n_inside[at]);
-            // A class that lies in the mask entirely keeps its number, so there are never more classes than
-            // pixels. The uncovered class is the exception: its number is reserved.
+            // A class entirely in the mask keeps its number, so there are never more classes than pixels; except the
+            // uncovered one, whose number is reserved.
             self.split[at] = class;
             if class == UNCOVERED || inside < self.sizes[at] {
                 self.split[at] = self.sizes.len() as u32;
@@ -125,9 +123,9 @@ impl Classes {
 
 /// Merges slivers, which ragged edges of overlapping masks leave, into their neighbours.
 ///
-/// A sliver has fewer pixels than a 10,000th of the raster and than an eighth of every mask that covers it. It
-/// joins the region, not itself a sliver, with which it shares the longest border; without such a neighbour it
-/// stays. A mask never disappears: if all of its regions would join others, its largest one stays.
+/// A sliver has fewer pixels than a 10,000th of the raster and an eighth of every mask that covers it. It joins the
+/// region, not itself a sliver, with the longest common border, or stays without such a neighbour. A mask never
+/// disappears: if all of its regions would join others, its largest one stays.
 pub fn absorb_slivers(map: &mut RegionMap, masks_of_region: &mut Vec<Vec<u32>>) {
     let mut size_of_region = vec![0_u32; map.n_regions as usize];
     let covered = map.region_of_pixel.iter().filter(|region| **region != NO_REGION);
@@ -148,7 +146,7 @@ pub fn absorb_slivers(map: &mut RegionMap, masks_of_region: &mut Vec<Vec<u32>>) 
         }
     }
 
-    // Renumbers the regions in the order of the scan.
+    // In the order of the scan.
     let mut number_of_region = vec![NO_REGION; map.n_regions as usize];
     let mut masks_of_number = Vec::new();
     for region in map.region_of_pixel.iter_mut().filter(|region| **region != NO_REGION) {
@@ -180,11 +178,11 @@ fn slivers(
     masks_of_region.iter().zip(size_of_region).map(is_sliver).collect()
 }
 
-/// Returns for each sliver the region, not itself a sliver, with which it shares the longest border (the first of
-/// equal ones); for every other region, and a sliver without such a neighbour, the region itself.
+/// For each sliver, the region, not itself a sliver, with the longest common border (the first of equals); for other
+/// regions, and slivers without such a neighbour, the region itself.
 fn longest_borders(map: &RegionMap, is_sliver: &[bool]) -> Vec<u32> {
     let is = |region: u32| region != NO_REGION && is_sliver[region as usize];
-    // (sliver, neighbour), once for each pair of pixels along their border.
+    // (sliver, neighbour), once per pair of pixels along their border.
     let mut borders = Vec::new();
     let width = (map.width_px as usize).max(1);
     for (at, a) in map.region_of_pixel.iter().enumerate() {
@@ -208,7 +206,7 @@ fn longest_borders(map: &RegionMap, is_sliver: &[bool]) -> Vec<u32> {
     longest.into_iter().map(|(_, region)| region).collect()
 }
 
-/// Numbers the classes in the order of a row-major scan, and collects the masks of each at its first pixel.
+/// Numbers classes in the order of a row-major scan, and collects each one's masks at its first pixel.
 fn number_regions(
     mut class_of_pixel: Vec<u32>,
     n_classes: usize,
@@ -243,7 +241,7 @@ fn number_regions(
     (map, first_pixels.iter().map(masks_at).collect())
 }
 
-/// Returns the nearest original pixel for each pixel centre of a resampled axis; empty if the original axis is.
+/// Nearest original pixel for each pixel centre of a resampled axis; empty if the original axis is.
 pub(crate) fn nearest(size_px: u32, target_size_px: u32) -> Vec<u32> {
     if size_px == 0 {
         return Vec::new();
@@ -253,7 +251,7 @@ pub(crate) fn nearest(size_px: u32, target_size_px: u32) -> Vec<u32> {
     (0..target).map(|i| ((2 * i + 1) * size / (2 * target)) as u32).collect()
 }
 
-/// Visits, in row-major order, the raster pixels with an image pixel in the mask.
+/// Visits, row-major, the raster pixels whose image pixel is in the mask.
 fn for_each_pixel(mask: &Mask, columns: &[u32], rows: &[u32], mut visit: impl FnMut(usize)) {
     let range = |axis: &[u32], low: u32, high: u32| {
         let (start, end) = (axis.partition_point(|p| *p < low), axis.partition_point(|p| *p < high));

@@ -1,15 +1,15 @@
 //! COCO's run-length encoding of masks.
 //!
-//! The runs alternate between outside and inside, column by column. Their compact text has signed base-32 digits,
-//! least significant first; from the third run on, it holds the difference to the run two before. This is the
-//! format of the COCO API (`maskApi.c`), which its authors call "similar to LEB128".
+//! Runs alternate between outside and inside, column by column. Their compact text has signed base-32 digits, least
+//! significant first; from the third run on, it holds the difference to the run two before. This is the format of the
+//! COCO API (`maskApi.c`), "similar to LEB128" to its authors.
 
 use serde::Serialize;
 
 use super::bits::Bits;
 use super::mask::{BoxPx, Mask};
 
-/// Most digits of a number with 32 bits and a sign, at 5 bits per digit.
+/// Most digits of a signed 32-bit number, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -35,7 +35,7 @@ pub enum RleError {
 }
 
 impl Rle {
-    /// Creates a mask from runs in column-major order, outside first.
+    /// Takes runs in column-major order, outside first.
     ///
     /// # Errors
     /// [`RleError::Size`] if the image is too large to count its pixels in 32 bits, [`RleError::Sum`] unless the runs
@@ -54,7 +54,6 @@ impl Rle {
         }
     }
 
-    /// Decodes COCO's compact text.
     pub fn from_text(width_px: u32, height_px: u32, text: &str) -> Result<Self, RleError> {
         let mut counts: Vec<u32> = Vec::new();
         let mut bytes = text.bytes().enumerate();
@@ -87,7 +86,7 @@ impl Rle {
         [self.width_px, self.height_px]
     }
 
-    /// Returns the first pixel (column-major) and the length of each run inside the mask.
+    /// First pixel (column-major) and length of each run inside the mask.
     fn runs_inside(&self) -> impl Iterator<Item = (u64, u64)> {
         let mut position = 0;
         self.counts.iter().enumerate().filter_map(move |(index, count)| {
@@ -97,7 +96,7 @@ impl Rle {
         })
     }
 
-    /// Returns the tight bounding box; `None` if the mask is empty.
+    /// Tight bounding box; `None` for an empty mask.
     pub fn box_px(&self) -> Option<BoxPx> {
         let height = u64::from(self.height_px);
         let mut box_px = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
@@ -109,16 +108,14 @@ impl Rle {
                 box_px.y0 = box_px.y0.min((start % height) as u32);
                 box_px.y1 = box_px.y1.max((last % height) as u32 + 1);
             } else {
-                // A run past the foot of a column contains the last row and the first row.
+                // A run past the foot of a column contains its last row and the next one's first.
                 (box_px.y0, box_px.y1) = (0, self.height_px);
             }
         }
         (box_px.x1 > 0).then_some(box_px)
     }
 
-    /// Decodes to a mask of level 0; `None` if the mask is empty.
-    ///
-    /// Allocates one bit per pixel of the bounding box, which [`Rle::box_px`] returns beforehand.
+    /// Decodes to a mask of level 0; `None` if empty. Allocates one bit per pixel of [`Rle::box_px`].
     pub fn to_mask(&self) -> Option<Mask> {
         let box_px = self.box_px()?;
         let width = box_px.width_px() as usize;

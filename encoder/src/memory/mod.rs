@@ -1,10 +1,8 @@
 //! The budget of working memory: named reservations.
 //!
-//! Each module that allocates what grows with the scene has a function `reserve`, beside the allocation, that
-//! names the purpose and states the bytes. The encoder calls them before the first view, and again once the views
-//! are done for what depends on masks and contributions.
-//!
-//! A reservation is a bound.
+//! Each module that allocates what grows with the scene has a function `reserve`, beside the allocation, that names the
+//! purpose and an upper bound of the bytes. The encoder calls them before the first view, and again after the views for
+//! what depends on masks and contributions.
 
 mod process;
 
@@ -43,7 +41,7 @@ pub enum Phase {
     Publish,
 }
 
-/// Those that hold memory; those that come before the contributions of all views are opened first.
+/// Phases that hold memory, first those before all views' contributions are opened.
 const PHASES: [Phase; 7] = [
     Phase::Views,
     Phase::Occupancy,
@@ -68,9 +66,8 @@ pub struct MemoryError {
     pub needed_bytes: u64,
     /// Whether no view was done yet.
     pub is_before_views: bool,
-    /// The step that needs the most.
     phase: Phase,
-    /// The reservations that are held at the same time, largest first.
+    /// Reservations held at the same time, largest first.
     pub parts: Vec<Reservation>,
 }
 
@@ -97,10 +94,9 @@ impl fmt::Display for MemoryError {
     }
 }
 
-/// The reservations of a run, within a budget.
-///
-/// The plan covers the scene, the photos in work with their masks and crops, places, landmarks, cells, codebooks,
-/// objects, superpoints, mask vectors and contributions. It does not cover models: ONNX Runtime states no bound.
+/// The reservations of a run, within a budget: scene, photos in work with their masks and crops, places, landmarks,
+/// cells, codebooks, objects, superpoints, mask vectors and contributions. Models are not covered: ONNX Runtime states
+/// no bound.
 #[derive(Clone, Debug)]
 pub struct MemoryPlan {
     available_bytes: u64,
@@ -121,8 +117,7 @@ impl MemoryPlan {
         self.is_before_views = false;
     }
 
-    /// Returns the bytes of the budget that are free during a phase. [`Self::rest`] are those that are free during
-    /// all.
+    /// Free bytes of the budget during a phase; [`Self::rest`] is the minimum over all.
     pub(crate) fn rest_of(&self, phase: Phase) -> u64 {
         self.available_bytes.saturating_sub(self.reserved_bytes(phase))
     }
@@ -135,7 +130,7 @@ impl MemoryPlan {
         self.reservations.iter().filter(move |r| r.phase == phase || r.phase == Phase::Always).copied()
     }
 
-    /// Returns the bytes that the most expensive phase leaves for the contributions that are read at a time.
+    /// Bytes that the most expensive phase leaves for the contributions read at a time.
     pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
         let phases = &PHASES[if self.is_before_views { 0 } else { N_BEFORE_MERGE }..];
         let most = phases.iter().copied().max_by_key(|phase| self.reserved_bytes(*phase));
@@ -170,7 +165,7 @@ mod tests {
         plan
     }
 
-    /// By hand: phases follow one another, so the largest one counts, beside what is always held.
+    /// By hand: phases follow one another, so the largest counts, beside what is always held.
     #[test]
     fn the_largest_phase_counts() {
         assert_eq!(plan(100).rest(30), Ok(30));
@@ -183,7 +178,7 @@ mod tests {
         assert_eq!(plan(69).rest_of(Phase::Cells), 0);
     }
 
-    /// Photos are gone once the views are done; until then fewer threads hold fewer of them.
+    /// Photos count until the views are done; fewer threads hold fewer of them.
     #[test]
     fn photos_count_until_the_views_are_done() {
         let mut plan = plan(100);

@@ -1,6 +1,6 @@
 //! The memory that this process really has, as Linux counts it.
 
-/// Returns the most bytes that the process has held so far; `None` on other systems than Linux.
+/// Peak memory of the process so far; `None` on other systems than Linux.
 pub fn peak_bytes() -> Option<u64> {
     status_bytes("VmHWM:")
 }
@@ -12,8 +12,8 @@ fn status_bytes(name: &str) -> Option<u64> {
     Some(kib * 1024)
 }
 
-/// Gives freed memory back to the system. The allocator of glibc keeps what threads freed for these threads alone,
-/// so that each phase would come on top of the one before.
+/// Returns freed memory to the system. glibc keeps what threads freed for these threads alone, so that the memory of
+/// phases would add up.
 pub fn give_back() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     trim();
@@ -31,15 +31,15 @@ fn trim() {
 mod tests {
     use super::*;
 
-    /// A thread frees 64 MB in pieces that the allocator keeps, with pieces between them that live on: given back,
-    /// they are no longer held, and the others are as they were. Other tests of this process may take as much
-    /// meanwhile, so there are several attempts.
+    /// A thread frees 64 MB in pieces that the allocator keeps, between pieces that live on: given back, they are no
+    /// longer held, and the others are intact. Several attempts, because other tests of this process may allocate
+    /// meanwhile.
     #[test]
     fn freed_memory_is_given_back_and_the_rest_is_kept() {
         let is_less_held = || {
             let kept: Vec<Vec<u8>> = std::thread::spawn(|| {
                 let pieces: Vec<Vec<u8>> = (0..2048u32).map(|i| vec![(i % 251) as u8; 1 << 15]).collect();
-                // Dropped: all but one of 64.
+                // Drops all but one of 64.
                 pieces.into_iter().enumerate().filter(|(i, _)| i % 64 == 0).map(|(_, piece)| piece).collect()
             })
             .join()
@@ -50,7 +50,7 @@ mod tests {
             for (i, piece) in kept.iter().enumerate() {
                 assert!(piece.iter().all(|x| *x == (64 * i % 251) as u8), "piece {i}");
             }
-            // The kernel counts the peak in batches of pages for each processor.
+            // The kernel counts the peak in batches of pages per processor.
             assert!(peak_bytes().expect("Linux") + (4 << 20) >= before);
             after + (32 << 20) < before
         };

@@ -1,14 +1,13 @@
 //! Which nodes of the tree are objects: those that views agree on.
 //!
-//! A view's agreement with a node is the best intersection over union between one of its masks and what it sees of
-//! the node. A node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan
-//! et al., CVPR 2024, judges masks), where masks that the photo's edge cuts off and views from afar count less. The
-//! nodes are chosen, none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of
-//! Gaussians: an object wins over its parts if views agree on it nearly as well.
+//! A view's agreement with a node is the best intersection over union of one of its masks with what it sees of the
+//! node. A node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan et al.,
+//! CVPR 2024, judges masks); masks cut off by the photo's edge and views from afar count less. The nodes are chosen,
+//! none part of another, with the largest sum of consensus^8 n^(1/4), n the number of Gaussians: an object wins over
+//! its parts if views agree on it nearly as well.
 //!
-//! A node without consensus is no object, nor is one that no photo shows whole: of a road, each photo's mask
-//! agrees with all that the photo sees of it, and none tells where it ends. A wide patch of ground is none either, as
-//! from high above photos show whole roads.
+//! A node that no photo shows whole is no object: each photo's mask of a road agrees with what the photo sees of it,
+//! and none tells where it ends. Nor is a wide patch of ground, as from high above photos show whole roads.
 
 use std::collections::BTreeMap;
 
@@ -18,25 +17,25 @@ use super::sightings::{Sightings, ViewSighting};
 use super::tree::Tree;
 use crate::ground::{Footprint, Standing};
 
-/// A view judges a node if it sees at least this share of it, in tenths: one side is enough. What it sees without
-/// an outline is no part of any of its masks.
+/// Least share of a node, in tenths, that a judging view sees: one side is enough. What it sees without an outline is
+/// in none of its masks.
 const OBSERVED_TENTHS: u64 = 1;
 /// Nodes below this consensus are no objects.
 const MIN_CONSENSUS: f64 = 0.3;
-/// A mask with more than this intersection over union shows the node: a majority of their union, so that no mask
-/// shows two nodes that have nothing in common.
+/// A mask with a larger intersection over union shows the node: a majority of their union, so that no mask shows two
+/// disjoint nodes.
 const SAME_IOU: f64 = 0.5;
-/// An object needs a view whose mask shows it, of which the photo's edge cuts off at most a tenth of the outline.
+/// An object needs a view with a mask of it whose outline the photo's edge cuts by at most a tenth.
 const WHOLE: f32 = 0.9;
-/// Least share of an object that such a view sees, in tenths: of ground a photo shows a patch and its mask outlines that.
+/// Least share of an object, in tenths, that such a view sees: photos of ground show and outline a patch of it.
 const WHOLE_TENTHS: u64 = 2;
-/// One of this many views that judge an object must show it whole: a car park that 2 of 39 photos outline is none.
+/// One in this many judging views must show an object whole: a car park that 2 of 39 photos outline is none.
 const JUDGES_PER_WHOLE: usize = 11;
-/// Agreement counts as much with a mask of what stands on the ground: all views agree on it, also where things touch.
+/// Factor of agreement with a mask of a standing thing: all views agree on it, also where things touch.
 const STANDING_TRUST: f64 = 0.75;
-/// A view that shows the node in fewer pixels counts proportionally less: one pixel of error spoils a small outline.
+/// Views of fewer pixels count proportionally less: one pixel of error spoils a small outline.
 const FULL_PX: f64 = 4096.0;
-/// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
+/// A view counts the square of its mask's uncut share of outline, and at least the square of this.
 const LEAST_UNCUT: f32 = 0.05;
 
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -44,11 +43,11 @@ struct NodeView {
     /// Gaussians that the view sees.
     n: u32,
     weight_px: f64,
-    /// Of these, those under each mask, by mask.
+    /// Of these, the Gaussians under each mask.
     masks: Vec<(u32, u32)>,
-    /// The best intersection over union of a mask.
+    /// Best intersection over union of a mask.
     agreement: f64,
-    /// Share of that mask's outline that the photo's edge does not cut off; 1 without one.
+    /// Uncut share of that mask's outline; 1 without one.
     uncut: f32,
 }
 
@@ -60,11 +59,11 @@ pub(super) struct Sizes<'a> {
     pub(super) of_masks: &'a [u32],
     /// `[n_masks]`: 1 - truncation.
     pub(super) uncut_shares: &'a [f32],
-    /// `[n_masks]`: whether a mask shows what stands on the ground.
+    /// `[n_masks]`: masks of standing things.
     pub(super) is_standing: &'a [bool],
     /// `[n]`: Gaussians of each superpoint.
     pub(super) of_superpoints: &'a [u32],
-    /// `[n]`: what each superpoint covers of the ground; empty without any.
+    /// `[n]`: ground that each superpoint covers; empty without any.
     pub(super) footprints: &'a [Footprint],
     pub(super) standing: &'a Standing,
     pub(super) min_gaussians: u32,
@@ -116,9 +115,9 @@ fn views_of(sightings: &Sightings, superpoint: usize, sizes: Sizes<'_>) -> NodeV
     sightings.of(superpoint).filter(|of_view| of_view.n > 0).map(of_view).collect()
 }
 
-/// Returns the worth of a node of `n` Gaussians as an object; 0 if it is none.
+/// Worth of a node of `n` Gaussians as an object; 0 if it is none.
 fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
-    // A view that outlines nothing of the node says nothing of it.
+    // A view that outlines nothing of the node is no judge.
     let is_judge =
         |view: &&NodeView| !view.masks.is_empty() && u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS;
     let judges = views.values().filter(is_judge);
@@ -142,10 +141,10 @@ fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     fourth * fourth * f64::from(n).sqrt().sqrt()
 }
 
-/// Returns the object of each superpoint, or `None`; objects are numbered in the order of their first superpoints.
+/// Object of each superpoint, or `None`; objects are numbered by their first superpoints.
 pub(super) fn objects(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<Option<u32>> {
     let worths = worths(tree, sightings, sizes);
-    // The best choice within each node: the node itself, or the best of its parts.
+    // The best choice within each node: the node, or the best of its parts.
     let mut best = worths.clone();
     for node in tree.n_leaves..tree.len() {
         let of_parts: f64 = tree.parts_of(node).into_iter().flatten().map(|part| best[part]).sum();
@@ -206,7 +205,7 @@ fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
     worths
 }
 
-/// Returns the object that each mask shows, or `None`. `object_of`: of each superpoint.
+/// Object that each mask shows, or `None`. `object_of`: by superpoint.
 pub(super) fn objects_of_masks(
     object_of: &[Option<u32>],
     sightings: &Sightings,
@@ -239,18 +238,18 @@ pub(super) fn objects_of_masks(
 mod tests {
     use super::*;
 
-    /// By hand: of 11 views one shows the node whole, and its edge cuts the others' masks; of 12 that is too few.
+    /// By hand: one of 11 views shows the node whole, the others' masks are cut; one of 12 is too few.
     #[test]
     fn one_of_eleven_views_must_show_an_object_whole_and_a_fifth_of_it() {
         let view = |uncut| NodeView { n: 10, weight_px: 4096.0, masks: vec![(0, 10)], agreement: 0.9, uncut };
         let views = |n: u32| (0..n).map(|at| (at, view(if at == 0 { 1.0 } else { 0.5 }))).collect();
         assert!((worth(&views(11), 16, 1) - 0.9_f64.powi(8) * 2.0).abs() < 1e-6);
         assert_eq!(worth(&views(12), 16, 1), 0.0);
-        // Of 50 Gaussians it sees a fifth, of 51 less.
+        // It sees a fifth of 50 Gaussians, and less of 51.
         assert!(worth(&views(11), 50, 1) > 0.0 && worth(&views(11), 51, 1) == 0.0);
     }
 
-    /// By hand: of a view that agrees to 0.9 and one that does to 0.5, a quarter as large, the mean is 0.82.
+    /// By hand: a view agrees to 0.9, one a quarter as large to 0.5; the mean is 0.82.
     #[test]
     fn views_from_afar_count_less() {
         let view =
@@ -260,7 +259,7 @@ mod tests {
         assert!((worth(&views(4096.0), 16, 1) - 0.7_f64.powi(8) * 2.0).abs() < 1e-9);
     }
 
-    /// By hand: of two masks that agree as well, one of what stands on the ground counts three quarters.
+    /// By hand: of two masks that agree equally, one of a standing thing counts three quarters.
     #[test]
     fn masks_of_what_stands_count_less() {
         let mut view =

@@ -18,13 +18,13 @@ use crate::lift::superpoint::{SuperpointSettings, Superpoints};
 use crate::lift::{ContributionError, RegionTable, SceneContributions};
 use crate::masks::Mask;
 
-/// Smaller objects are dropped, as the robot drops smaller clusters.
+/// Smaller objects are dropped, as robots drop smaller clusters.
 const MIN_GAUSSIANS: u32 = 10;
-/// Share of the means that an object's box leaves out on either side of each axis, as boxes of clusters do:
-/// floaters would make the box as large as the room.
+/// Share of the means outside an object's box on either side of each axis, as for clusters: floaters would make the box
+/// as large as the room.
 const TRIMMED: f64 = 0.02;
 
-/// Finds the objects of a scene while its refinement is pending: nothing is mixed yet. `superpoints`: where absent, they
+/// Finds a scene's objects while its refinement is pending, before anything is mixed. `superpoints`: if absent, they
 /// are found from colour and shape.
 pub(crate) fn find(
     scene: &SceneContributions<'_>,
@@ -79,16 +79,15 @@ pub(crate) fn find(
     Ok(SceneObjects { objects, object_of, thumbnails: Vec::new(), calibration, report })
 }
 
-/// The masks of each object, and how well each mask shows its object.
 struct Masks {
     of_object: Vec<Vec<u32>>,
-    /// `[n_masks]`: blending weight of all Gaussians under the mask, pixels.
+    /// `[n_masks]`: blending weight under the mask, pixels.
     weights: Vec<f64>,
-    /// `[n_masks]`: of that, the weight of the Gaussians of its object.
+    /// `[n_masks]`: of that, the weight of its object's Gaussians.
     own_weights: Vec<f64>,
     /// `[n_masks]`: 1 - truncation.
     uncut_shares: Vec<f32>,
-    /// `[n_masks]`: the view, and the number within it.
+    /// `[n_masks]`: view, and index within it.
     places: Vec<(u32, u32)>,
 }
 
@@ -122,8 +121,8 @@ impl Masks {
         masks
     }
 
-    /// Returns the mask that shows an object best: the one with the largest product of the weight of the object's
-    /// Gaussians, their share of the mask's weight, and 1 - truncation.
+    /// Returns the mask with the largest product of the weight of the object's Gaussians, their share of the mask's
+    /// weight, and 1 - truncation.
     fn best_of(&self, object: usize) -> usize {
         let merit = |mask: u32| {
             let (own, all) = (self.own_weights[mask as usize], self.weights[mask as usize]);
@@ -171,7 +170,7 @@ fn describe(
     gaussians.into_par_iter().enumerate().map(object).collect()
 }
 
-/// Returns the box without the outermost means, and the mean of those inside.
+/// Box without the outermost means, and the mean of those inside.
 fn trimmed_box(means: &[DVec3]) -> (DVec3, Aabb) {
     let mut bounds = Aabb { min: DVec3::ZERO, max: DVec3::ZERO };
     for axis in 0..3 {

@@ -19,8 +19,7 @@ pub(crate) use find::find;
 pub use object::{NONE, Object, ObjectsReport, SceneObjects};
 pub(crate) use thumbnails::cut as cut_thumbnails;
 
-/// Reserves what finding the objects of a scene takes, and the object of each Gaussian. `has_superpoints`: they
-/// are given.
+/// Reserves the search for objects, and each Gaussian's object. `has_superpoints`: they are given.
 pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, has_superpoints: bool) {
     let labels_bytes = (n_gaussians * size_of::<u32>()) as u64;
     memory.reserve(Phase::Always, "the object of each Gaussian", labels_bytes);
@@ -31,7 +30,6 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, has_superpoin
     }
 }
 
-/// Reserves what depends on the contributions, once all views are done.
 pub(crate) fn reserve_contributions(memory: &mut MemoryPlan, n_entries: u64) {
     sightings::reserve(memory, n_entries);
 }

@@ -8,9 +8,9 @@ use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::memory::{MemoryPlan, Phase};
 
 const MAX_SAMPLES: usize = 4;
-/// Gaussians for each sample, where superpoints are so small that there would be more samples.
+/// Least Gaussians per sample, for small superpoints.
 const GAUSSIANS_PER_SAMPLE: usize = 8;
-/// Samples that are near a sample: with those of its own superpoint, those of a dozen.
+/// Nearest samples of a sample: with its own superpoint's, those of a dozen.
 const N_NEIGHBOURS: usize = 48;
 
 pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
@@ -22,8 +22,8 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     memory.reserve(Phase::Objects, "superpoints near each other", len_bytes);
 }
 
-/// Returns the pairs of superpoints that lie near each other: a sampled Gaussian of one is among the nearest
-/// neighbours of a sample of the other. The lower number comes first; pairs are ascending.
+/// Pairs of superpoints with a sampled Gaussian of one among the nearest neighbours of a sample of the other. The lower
+/// number comes first; pairs are ascending.
 pub(super) fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u32)> {
     let samples = samples(superpoints);
     let points: Vec<[f64; 3]> =
@@ -43,8 +43,8 @@ pub(super) fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u
     pairs
 }
 
-/// Returns up to [`MAX_SAMPLES`] Gaussians of each superpoint, spread evenly over its own in the order of the
-/// scene: superpoint and Gaussian, ascending.
+/// Up to [`MAX_SAMPLES`] Gaussians of each superpoint, evenly spread in the scene's order: (superpoint, Gaussian),
+/// ascending.
 fn samples(superpoints: &Superpoints) -> Vec<(u32, u32)> {
     let sizes = superpoints.sizes();
     let most = superpoints.of_gaussian.len() / GAUSSIANS_PER_SAMPLE / superpoints.n.max(1);
@@ -74,8 +74,7 @@ mod tests {
 
     use super::*;
 
-    /// By hand: 40 superpoints of 10 Gaussians along a line; the 24 nearest samples on either side are those of
-    /// six.
+    /// By hand: 40 superpoints of 10 Gaussians along a line; the 24 nearest samples on either side are those of six.
     #[test]
     fn pairs_are_near_and_samples_are_even() {
         let n = 400u32;
@@ -87,7 +86,7 @@ mod tests {
         of_gaussian[0] = NO_SUPERPOINT;
         let few = samples(&Superpoints { of_gaussian: of_gaussian.clone(), n: 40 });
         assert_eq!((few.len(), &few[..3]), (40, &[(0, 1), (1, 10), (2, 20)][..]));
-        // Others without a superpoint: there are Gaussians enough for four samples each.
+        // Gaussians without a superpoint: now there are enough for four samples each.
         of_gaussian.resize(1300, NO_SUPERPOINT);
         let superpoints = Superpoints { of_gaussian, n: 40 };
         let found = samples(&superpoints);

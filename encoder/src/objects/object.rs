@@ -36,7 +36,7 @@ pub struct Object {
 }
 
 impl Object {
-    /// Returns its row of an encode's report.
+    /// Row of an encode's report.
     pub fn found(&self) -> FoundObject {
         FoundObject {
             id: public_id(self.id),
@@ -51,13 +51,13 @@ impl Object {
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneObjects {
-    /// In the order of their first superpoints.
+    /// Ordered by their first superpoints.
     pub objects: Vec<Object>,
-    /// `[cell][N of the cell]`: index of each Gaussian's object, or [`NONE`].
+    /// `[cell][N of the cell]`: index of the object, or [`NONE`].
     pub object_of: Vec<Vec<u32>>,
-    /// `[n]`: a small picture of each object, a JPEG file or nothing; empty where none are asked for.
+    /// `[n]`: JPEG files, empty for none; an empty list if not asked for.
     pub thumbnails: Vec<Vec<u8>>,
-    /// Mean and spread of the text bank's scores over the objects.
+    /// Of the text bank's scores over the objects.
     pub calibration: Calibration,
     pub report: ObjectsReport,
 }
@@ -72,13 +72,13 @@ pub struct ObjectsReport {
     pub largest_m: f64,
 }
 
-/// Most medoids of an object, in addition to its mean: one for each side of an object.
+/// Most medoids beside the mean: one for each side of an object.
 pub(super) const MAX_MEDOIDS: usize = 4;
-/// Most masks considered, the heaviest first: more hardly change the medoids, and time grows with the square.
+/// Most masks considered, heaviest first: more hardly change the medoids, and time grows with the square.
 const MAX_MASKS: usize = 256;
 
-/// Returns `[n][dim]`: the direction of the weighted mean of some masks' vectors, then medoids. Each medoid in
-/// turn is the mask that most raises the weighted mean of all masks' cosines with their nearest medoid.
+/// Returns `[n][dim]`: the direction of the masks' weighted mean, then medoids. Each medoid in turn is the mask that
+/// most raises the weighted mean of all masks' cosines with their nearest medoid.
 pub(super) fn choose_vectors(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
     let dim = table.dim();
     let vector = |mask: u32| table.mask_vectors().get(mask as usize);
@@ -94,7 +94,7 @@ pub(super) fn choose_vectors(masks: &[u32], weights: &[f64], table: &RegionTable
     let length = mean.iter().map(|m| m * m).sum::<f64>().sqrt();
     let mut chosen: Vec<f32> = match length > 0.0 {
         true => mean.iter().map(|m| (m / length) as f32).collect(),
-        // Vectors that cancel have no mean direction: the heaviest one replaces it.
+        // Vectors that cancel have no mean direction: the heaviest replaces it.
         false => vector(masks[0]).to_vec(),
     };
     let n = masks.len();
@@ -118,7 +118,7 @@ pub(super) fn choose_vectors(masks: &[u32], weights: &[f64], table: &RegionTable
     chosen
 }
 
-/// Returns the mean and spread of the text bank's scores over objects, as cells have them over Gaussians.
+/// Mean and spread of the text bank's scores over objects, as cells have them over Gaussians.
 pub(super) fn calibrate(objects: &[Object], score_context: &ScoreMetricContext, dim: usize) -> Calibration {
     let (mut sum, mut squares, mut n) = (0.0, 0.0, 0.0f64);
     for object in objects {

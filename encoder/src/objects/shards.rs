@@ -10,13 +10,12 @@ use slag_math::cholesky::{SmallPivots, cholesky};
 
 use super::object::{MAX_MEDOIDS, NONE, Object, SceneObjects};
 
-/// Vectors of an object: the mean of its masks' and the medoids.
 const N_VECTORS: usize = 1 + MAX_MEDOIDS;
 
-/// The basis of a shard's centroids, and the projection of vectors onto it.
+/// A shard's centroid basis, and the projection onto it.
 pub struct CentroidBasis<'a> {
     dim: usize,
-    /// Mean, and `[m][dim]`; `None`: a vector's components are its own.
+    /// Mean, and `[m][dim]`; `None`: vectors are their own components.
     basis: Option<(&'a [f16], Vec<f64>)>,
     /// `[m][m]`: lower triangle of the Cholesky factor of the basis vectors' products.
     factor: Vec<f64>,
@@ -44,7 +43,7 @@ impl<'a> CentroidBasis<'a> {
                 products[i * m + j] = row(i).iter().zip(row(j)).map(|(a, b)| a * b).sum();
             }
         }
-        // A vector that depends on those before gets no component.
+        // Dependent basis vectors get no component.
         prepared.factor = cholesky(products, m, SmallPivots::Drop(1e-9));
         prepared
     }
@@ -53,7 +52,7 @@ impl<'a> CentroidBasis<'a> {
         self.basis.as_ref().map_or(self.dim, |(_, vectors)| vectors.len() / self.dim)
     }
 
-    /// Returns the components (`[n][m]`) of the nearest vectors in the span of the basis, by least squares.
+    /// Components (`[n][m]`) of the nearest vectors in the basis's span, by least squares.
     pub fn components(&self, vectors: &[f32]) -> Vec<f32> {
         let Some((mean, basis)) = &self.basis else { return vectors.to_vec() };
         let m = self.m();
@@ -78,8 +77,7 @@ impl<'a> CentroidBasis<'a> {
         vectors.chunks_exact(self.dim).flat_map(solve).collect()
     }
 
-    /// Returns the largest distance between vectors (`[n][dim]`) and those that their rounded components decode
-    /// to.
+    /// Largest distance between vectors (`[n][dim]`) and their decoded rounded components.
     fn largest_error(&self, vectors: &[f32], components: &[i8], steps: &[f32]) -> f32 {
         let m = self.m();
         let of_vector = |((vector, components), step): ((&[f32], &[i8]), &f32)| {
@@ -96,7 +94,7 @@ impl<'a> CentroidBasis<'a> {
             made.iter().zip(vector).map(|(made, v)| (made - f64::from(*v)).powi(2)).sum::<f64>().sqrt()
         };
         let all = vectors.chunks_exact(self.dim).zip(components.chunks_exact(m.max(1))).zip(steps);
-        // Rounded up, so that it stays a bound in f32.
+        // Rounded up to stay a bound in f32.
         all.map(of_vector).fold(0.0, f64::max) as f32 * (1.0 + 2.0 * f32::EPSILON)
     }
 }
@@ -109,18 +107,17 @@ pub struct CellObjects {
     run_ends: Vec<u32>,
     run_objects: Vec<u16>,
     photos: String,
-    /// Ends, and JPEG files one after the other.
+    /// Ends, and concatenated JPEG files.
     thumbnails: (Vec<u32>, Vec<u8>),
 }
 
 impl CellObjects {
-    /// Collects the objects of a cell. `locals`: its Gaussians in the order of the shard; `basis`: of its
-    /// centroids.
+    /// `locals`: the cell's Gaussians in the shard's order; `basis`: of its centroids.
     pub fn new(scene: &SceneObjects, cell_id: u32, locals: &[u32], basis: &CentroidBasis<'_>) -> Self {
         let object_of = &scene.object_of[cell_id as usize];
         let mut n_here = vec![0u32; scene.objects.len()];
         object_of.iter().filter(|object| **object != NONE).for_each(|object| n_here[*object as usize] += 1);
-        // A cell has at most 65,536 Gaussians: objects beyond the limit are all but impossible.
+        // Objects beyond the limit are all but impossible: a cell has at most 65,536 Gaussians.
         let here: Vec<usize> =
             (0..n_here.len()).filter(|object| n_here[*object] > 0).take(usize::from(NO_OBJECT) - 1).collect();
         let mut cell = Self {
@@ -161,7 +158,7 @@ impl CellObjects {
 
     fn add(&mut self, object: &Object, n_gaussians_here: u32, basis: &CentroidBasis<'_>) {
         let name = plain(&object.photo);
-        // Many objects share the photo that shows them best.
+        // Many objects share their best photo.
         let photo_start = self.photos.find(&name).unwrap_or_else(|| {
             self.photos.push_str(&name);
             self.photos.len() - name.len()
@@ -199,7 +196,7 @@ impl CellObjects {
     }
 }
 
-/// Returns a name without control characters, cut to the length that readers accept.
+/// A name without control characters, cut to the readers' limit.
 fn plain(name: &str) -> String {
     let mut plain: String =
         name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();

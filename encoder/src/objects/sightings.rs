@@ -6,42 +6,38 @@ use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::lift::{ContributionError, PartContributions, RegionTable, SceneContributions};
 use crate::memory::{MemoryPlan, Phase};
 
-/// A view sees a Gaussian if its weight there is at least this share of that in its best view: remnants behind
-/// other Gaussians say nothing.
+/// Least weight of a seen Gaussian relative to its best view: remnants behind others say nothing.
 const MIN_WEIGHT_SHARE: f32 = 0.1;
-/// Gaussians that a thread goes through at once.
 const GAUSSIANS_PER_TASK: usize = 1 << 12;
 /// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, 15 in labelled
 /// scenes.
 const ENTRIES_PER_REGION: u64 = 8;
 
-/// What a view shows of a superpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ViewSighting<'a> {
     pub(super) view: u32,
     /// The superpoint's Gaussians that it sees.
     pub(super) n: u32,
-    /// Their blending weight, and that of those behind others.
+    /// Blending weight of these and of hidden ones.
     pub(super) weight_px: f64,
-    /// The masks that show it, ascending, but for fillers: their outlines are nobody's.
+    /// Masks that show it, ascending, without fillers, whose outlines say nothing.
     pub(super) masks: &'a [MaskSighting],
 }
 
-/// What a mask shows of a superpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct MaskSighting {
     pub(super) mask: u32,
     /// The superpoint's Gaussians that the view sees under it.
     pub(super) n: u32,
-    /// Blending weight of its Gaussians under the mask, pixels.
+    /// Blending weight of the superpoint under the mask, pixels.
     pub(super) weight: f64,
 }
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Sightings {
-    /// `[n + 1]`: where each superpoint's views start.
+    /// `[n + 1]`: start of each superpoint's views.
     starts: Vec<usize>,
-    /// View, Gaussians, weight, and where its masks start; one more at the end.
+    /// View, Gaussians, weight, and start of its masks; one more at the end.
     views: Vec<(u32, u32, f64, usize)>,
     masks: Vec<MaskSighting>,
 }
@@ -60,7 +56,7 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_entries: u64) {
 }
 
 impl Sightings {
-    /// Gathers what the views show, in one pass over all contributions.
+    /// One pass over all contributions.
     pub(super) fn gather(
         scene: &SceneContributions<'_>,
         table: &RegionTable,
@@ -82,7 +78,7 @@ impl Sightings {
                 .collect();
             found.into_iter().for_each(|mut found| entries.append(&mut found));
         }
-        // Of one pair in the order of the parts: sums are the same every time.
+        // Stable: entries of a pair stay in the order of parts, so sums are the same every time.
         entries.par_sort_by_key(|entry| (entry.superpoint, entry.region));
         Ok(Self::new(superpoints.n, &join(entries), table, &view_of_region))
     }
@@ -128,7 +124,7 @@ impl Sightings {
         self.starts.len().saturating_sub(1)
     }
 
-    /// Returns what each view shows of a superpoint, views ascending.
+    /// By view, ascending.
     pub(super) fn of(&self, superpoint: usize) -> impl Iterator<Item = ViewSighting<'_>> {
         (self.starts[superpoint]..self.starts[superpoint + 1]).map(|at| {
             let (view, n, weight_px, first) = self.views[at];
@@ -136,14 +132,14 @@ impl Sightings {
         })
     }
 
-    /// Returns what each mask shows of each superpoint, superpoint by superpoint.
+    /// All masks, by superpoint.
     pub(super) fn masks(&self) -> impl Iterator<Item = (usize, &MaskSighting)> {
         (0..self.len())
             .flat_map(|at| self.of(at).flat_map(move |of_view| of_view.masks.iter().map(move |of| (at, of))))
     }
 }
 
-/// Returns what regions show of the superpoints of some Gaussians, which are consecutive in a part.
+/// Entries of superpoints and regions, from consecutive Gaussians of a part.
 fn of_gaussians(
     contributions: &PartContributions,
     first: usize,
@@ -170,7 +166,7 @@ fn of_gaussians(
     join(found)
 }
 
-/// Adds entries of one pair together; they are sorted by pair.
+/// Sums entries of equal pairs, which are sorted by pair.
 fn join(mut entries: Vec<Entry>) -> Vec<Entry> {
     entries.dedup_by(|next, kept| {
         let is_same = (next.superpoint, next.region) == (kept.superpoint, kept.region);
@@ -183,8 +179,7 @@ fn join(mut entries: Vec<Entry>) -> Vec<Entry> {
     entries
 }
 
-/// Returns, for each view that sees a Gaussian, the region with most of its weight there. Entries are by view,
-/// then region.
+/// For each view that sees a Gaussian, the region with most of its weight. Entries are by view, then region.
 fn seen(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<u32> {
     let mut views: Vec<(u32, f32, u32, f32)> = Vec::new();
     for (region, weight) in regions.iter().zip(weights) {
@@ -208,8 +203,7 @@ fn seen(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<u32> {
 mod tests {
     use super::*;
 
-    /// Computed by hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 less than a tenth, view 3
-    /// nothing.
+    /// By hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 less than a tenth, view 3 nothing.
     #[test]
     fn a_gaussian_shows_the_region_of_most_weight_where_it_is_seen() {
         let view_of_region = [0, 0, 1, 1, 1, 2, 3];

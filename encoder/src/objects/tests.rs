@@ -20,7 +20,7 @@ use crate::lift::{
 };
 use crate::masks::Mask;
 
-/// Things in a row of cells, in files of contributions; thing i's masks have the vector of axis i.
+/// Things in a row of cells, as contribution files; masks of thing i have the vector of axis i.
 struct World {
     gaussians: Gaussians,
     split: CellSplit,
@@ -39,7 +39,7 @@ fn world() -> World {
     let means =
         (0..n).map(|i| DVec3::new(f64::from(i / PER_THING) * 10.0, f64::from(i % PER_THING) * 0.1, 0.0));
     let gaussians = Gaussians::balls(means.collect(), 0.1);
-    // Cells of at most 70: the things are cut.
+    // Cells of at most 70 cut the things.
     let split = split(&gaussians, CellLimits::by_count(70));
     let mut random = Random::new(3);
     let mut views = Vec::new();
@@ -51,7 +51,7 @@ fn world() -> World {
             }
             let (cell, local) = (split.cell_of_gaussian[i as usize], split.local_of_gaussian[i as usize]);
             let thing = i / PER_THING;
-            // A little of each lies under a neighbour's mask too: the last view sees thing 2 whole and large.
+            // Some of each lies under a neighbour's mask; the last view sees thing 2 whole and large.
             let weight = if view == 5 && thing == 2 { 9.0 } else { 1.0 + random.below(8) as f32 / 8.0 };
             let spilt = Contribution { local, region: (thing + 1) % 3, weight: 0.25 };
             let mut of_gaussian = vec![Contribution { local, region: thing, weight }, spilt];
@@ -120,7 +120,7 @@ impl World {
     }
 }
 
-/// Oracle: the things that the world was made of.
+/// Oracle: the world's things.
 #[test]
 fn objects_are_the_things_for_any_threads_and_memory() {
     let world = world();
@@ -146,7 +146,7 @@ fn objects_are_the_things_for_any_threads_and_memory() {
             assert_eq!((object.photo.as_str(), object.photo_box_px), ("5.jpg", [5, 2, 15, 12]));
         }
     }
-    // Where that photo's edge cuts most of the thing off, another one shows it better.
+    // If that photo's edge cuts most of the thing off, another one shows it better.
     let mut cut = self::world();
     cut.photos[5].outlines[2].cut_px = 38;
     let of_thing = |objects: &[Object]| objects.iter().position(|object| object.photo_box_px[1] == 2);
@@ -160,7 +160,7 @@ fn objects_are_the_things_for_any_threads_and_memory() {
     }
 }
 
-/// By hand: views that only fill judge nothing, so objects, their masks and their consensus are those of the others.
+/// By hand: fillers judge nothing, so objects, masks and consensus are those of the other views.
 #[test]
 fn fillers_are_no_evidence() {
     let mut world = world();
@@ -176,7 +176,7 @@ fn fillers_are_no_evidence() {
     assert!(world.objects(u64::MAX).objects.is_empty());
 }
 
-/// By hand: of the thing 0 all photos cut a quarter of the outline off, then one of them a tenth.
+/// By hand: all photos cut a quarter of thing 0's outline off, then one of them a tenth.
 #[test]
 fn what_no_photo_shows_whole_is_no_object() {
     let mut world = world();
@@ -192,9 +192,8 @@ fn a_search_can_be_cancelled() {
     assert!(matches!(found, Err(ContributionError::Cancelled)));
 }
 
-/// By hand: at the ends of a row, two pieces that are near nothing of each other, and in two views one mask over
-/// both: each has an intersection over union of one half with it. None has a mask of its own, so none is an
-/// object.
+/// By hand: two isolated pieces at the ends of a row, and in two views one mask over both, each with an intersection
+/// over union of one half with it. Neither has a mask of its own, so neither is an object.
 #[test]
 fn a_mask_is_of_one_object_at_most() {
     let (n, per_superpoint) = (1500u32, 10u32);
@@ -218,7 +217,7 @@ fn a_mask_is_of_one_object_at_most() {
     assert!(found.objects.is_empty(), "{:?}", found.objects);
 }
 
-/// Sums beyond 64 bits stay at the largest: thousands of views of billions of Gaussians.
+/// Sums saturate at 64 bits: thousands of views of billions of Gaussians.
 #[test]
 fn evidence_saturates() {
     let mut evidence = Evidence { together: u64::MAX - 1, n: u64::MAX - 1 };
@@ -226,7 +225,6 @@ fn evidence_saturates() {
     assert_eq!(evidence, Evidence { together: u64::MAX, n: u64::MAX });
 }
 
-/// What shards say is what was found, in any order of the Gaussians.
 #[test]
 fn shards_carry_the_objects_of_their_cell() {
     let world = world();
@@ -254,15 +252,15 @@ fn shards_carry_the_objects_of_their_cell() {
     }
 }
 
-/// Oracle: the normal equations, and the definition of what is kept, in float64. Vectors that the basis can make
-/// come back, of others what is left is at right angles to it, and the stated bound is the largest distance.
+/// Oracle: normal equations and the definition of what is kept, in float64. Vectors in the basis's span come back; of
+/// others the rest is at right angles to it, and the stated bound is the largest distance.
 #[test]
 fn vectors_are_kept_in_the_basis_of_centroids() {
     let mut random = Random::new(9);
     let mut small = |n: usize| -> Vec<i8> { (0..n).map(|_| random.below(255) as u8 as i8).collect() };
     let (m, dim) = (5, 16);
     let mut vectors = small(m * dim);
-    // The last is twice another: no component of its own is needed.
+    // The last is twice another and needs no component.
     let repeated: Vec<i8> = vectors[..dim].iter().map(|v| v / 2 * 2).collect();
     vectors[..dim].copy_from_slice(&repeated);
     vectors[(m - 1) * dim..].iter_mut().zip(&repeated).for_each(|(last, v)| *last = v / 2);
@@ -294,7 +292,7 @@ fn vectors_are_kept_in_the_basis_of_centroids() {
     }
 }
 
-/// By hand: of 100 contributions an eighth, each with an entry of 24 bytes and one of 16.
+/// By hand: an eighth of 100 contributions, each with an entry of 24 bytes and one of 16.
 #[test]
 fn lists_are_reserved() {
     let rest = |available_bytes: u64, n_entries: u64| {

@@ -15,16 +15,15 @@ use crate::progress::Progress;
 
 /// Longest edge.
 const EDGE_PX: u32 = 128;
-/// Share of a box's longer edge that is shown on each side of it.
+/// Margin on each side, as a share of the box's longer edge.
 const AROUND: f64 = 0.15;
-/// The best that makes a file short enough is taken. Noise has 9 kB with the least.
+/// The best one with a short enough file is taken. Noise has 9 kB with the least.
 const JPEG_QUALITIES: [u8; 2] = [75, 30];
 
-/// Objects and their JPEG files.
 type Cuts = Vec<(usize, Vec<u8>)>;
 
-/// Cuts a JPEG thumbnail for each object, `[n]`: empty if its photo is unreadable or the run was cancelled. Returns
-/// the first error, too. `views`: sorted by name.
+/// Cuts a JPEG thumbnail per object, `[n]`: empty if its photo is unreadable or the run was cancelled. Also returns the
+/// first error. `views`: sorted by name.
 pub(crate) fn cut<E: Send>(
     objects: &[Object],
     views: &[&View],
@@ -57,7 +56,7 @@ pub(crate) fn cut<E: Send>(
     (thumbnails, fault)
 }
 
-/// Returns the part of a photo around a box as a JPEG file, at most [`EDGE_PX`] wide and high.
+/// JPEG of a photo around a box, at most [`EDGE_PX`] wide and high.
 fn jpeg(photo: &RgbImage, box_px: [u32; 4]) -> Vec<u8> {
     let cut = around(photo, box_px);
     let (width, height) = (cut.width(), cut.height());
@@ -73,7 +72,6 @@ fn jpeg(photo: &RgbImage, box_px: [u32; 4]) -> Vec<u8> {
     encoded.into_iter().find(|bytes| bytes.len() <= MAX_THUMBNAIL_BYTES).unwrap_or_default()
 }
 
-/// Returns the part of a photo around a box of pixels x0, y0, x1, y1.
 fn around(photo: &RgbImage, [x0, y0, x1, y1]: [u32; 4]) -> SubImage<&RgbImage> {
     let margin = (f64::from((x1 - x0).max(y1 - y0)) * AROUND).round() as u32;
     let range = |low: u32, high: u32, size: u32| {
@@ -90,7 +88,7 @@ mod tests {
 
     use super::*;
 
-    /// By hand: a box of 300 x 100 px at (90, 30). The margin is 45 px, but above the box there are only 30.
+    /// By hand: a box of 300 x 100 px at (90, 30). The margin is 45 px, but only 30 above the box.
     #[test]
     fn the_box_is_shown_with_a_margin_and_made_small() {
         let is_inside = |x: u32, y: u32| (90..390).contains(&x) && (30..130).contains(&y);

@@ -14,18 +14,18 @@ use super::sightings::{MaskSighting, Sightings, ViewSighting};
 /// A forest over superpoints.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Tree {
-    /// Superpoints: nodes 0 to `n_leaves - 1`.
+    /// Superpoints are nodes 0 to `n_leaves - 1`.
     pub(super) n_leaves: usize,
-    /// The two parts of each further node; both have lower numbers.
+    /// Parts of each further node; both have lower numbers.
     pub(super) parts: Vec<[u32; 2]>,
 }
 
-/// Two slots to be joined: affinity as bits, which have the order of positive numbers, then the slots.
+/// Affinity as bits, which have the order of positive numbers, then the two slots to join.
 type Pair = (u64, Reverse<u32>, Reverse<u32>);
 
 impl Tree {
-    /// Joins `n` superpoints until no two have evidence. Of equal affinities the pair with the lowest numbers
-    /// comes first; a join goes by the number of the part that is near more others, of equally many the lower one.
+    /// Joins `n` superpoints until no two have evidence. Equal affinities go by the lowest numbers; a join keeps the
+    /// number of the part near more others, of equals the lower one.
     pub(super) fn new(n: usize, pairs: &[(u32, u32, Evidence)]) -> Self {
         let mut tree = Self { n_leaves: n, parts: Vec::new() };
         let mut neighbours: Vec<BTreeMap<u32, Evidence>> = vec![BTreeMap::new(); n];
@@ -41,7 +41,7 @@ impl Tree {
             pairs.iter().map(|(a, b, evidence)| pair(*a, *b, evidence)).collect();
         let mut node_of: Vec<u32> = (0..n as u32).collect();
         while let Some((affinity, Reverse(a), Reverse(b))) = waiting.pop() {
-            // Otherwise one of them has been joined, or has other evidence since.
+            // Otherwise one of them has been joined, or has new evidence.
             if neighbours[a as usize].get(&b).map(bits) != Some(affinity) {
                 continue;
             }
@@ -68,13 +68,13 @@ impl Tree {
         self.n_leaves + self.parts.len()
     }
 
-    /// Returns the parts of a node; `None` for a superpoint.
+    /// `None` for a superpoint.
     pub(super) fn parts_of(&self, node: usize) -> Option<[usize; 2]> {
         let at = node.checked_sub(self.n_leaves)?;
         Some(self.parts[at].map(|part| part as usize))
     }
 
-    /// Returns the nodes that are part of no other, ascending.
+    /// Nodes that are part of no other, ascending.
     pub(super) fn roots(&self) -> impl Iterator<Item = usize> {
         let mut is_part = vec![false; self.len()];
         self.parts.iter().flatten().for_each(|part| is_part[*part as usize] = true);
@@ -82,21 +82,20 @@ impl Tree {
     }
 }
 
-/// A mask shows a superpoint if it has at least this share of its Gaussians that the view sees, in halves.
+/// A mask shows a superpoint if it has at least this share, in halves, of its Gaussians that the view sees.
 const INSIDE_HALVES: u32 = 1;
-/// Affinity without evidence, and the Gaussians that it counts for.
+/// Affinity without evidence, and the number of Gaussians that it counts for.
 const PRIOR: f64 = 0.3;
 const PRIOR_WEIGHT: f64 = 1.0;
 /// A share of 1.
 pub(super) const SHARE: u64 = 1 << 20;
 
-/// What views say about two superpoints, or two sets of them; evidence is added. Integers, so that sums do not
-/// depend on their order.
+/// What views say about two superpoints or sets of them; evidence adds up. Integers, so that order does not matter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Evidence {
-    /// Sum over the views of the share of masks that show both, in units of [`SHARE`], times Gaussians.
+    /// Sum over views: share of masks that show both, in units of [`SHARE`], times Gaussians.
     pub(super) together: u64,
-    /// Sum over the views of the Gaussians of the smaller one.
+    /// Sum over views: Gaussians of the smaller one.
     pub(super) n: u64,
 }
 
@@ -108,13 +107,13 @@ impl Evidence {
 
 impl std::ops::AddAssign for Evidence {
     fn add_assign(&mut self, other: Self) {
-        // A share takes 20 bits: thousands of views of billions of Gaussians are the limit.
+        // Shares take 20 bits: thousands of views of billions of Gaussians are the limit.
         self.together = self.together.saturating_add(other.together);
         self.n = self.n.saturating_add(other.n);
     }
 }
 
-/// Returns the evidence of each pair; pairs that no mask shows together are left out.
+/// Leaves out pairs that no mask shows together.
 pub(super) fn evidence_of_pairs(sightings: &Sightings, pairs: &[(u32, u32)]) -> Vec<(u32, u32, Evidence)> {
     let of_pair = |(a, b): &(u32, u32)| (*a, *b, of_pair(sightings, *a as usize, *b as usize));
     pairs.par_iter().map(of_pair).filter(|(_, _, evidence)| evidence.together > 0).collect()
@@ -129,7 +128,7 @@ fn of_pair(sightings: &Sightings, a: usize, b: usize) -> Evidence {
             Ordering::Greater => drop(of_b.next()),
             Ordering::Equal => {
                 let (n_both, n_either) = shared(a, b);
-                // A view with no mask of either is no evidence.
+                // Without a mask of either, a view is no evidence.
                 if let Some(share) = (n_both * SHARE).checked_div(n_either) {
                     let n = u64::from(a.n.min(b.n));
                     evidence += Evidence { together: n * share, n };
@@ -142,8 +141,7 @@ fn of_pair(sightings: &Sightings, a: usize, b: usize) -> Evidence {
     evidence
 }
 
-/// Returns the number of masks that show both superpoints, and of those that show either; none where a view sees
-/// one alone.
+/// Number of masks that show both superpoints, and of those that show either; zeros if a view sees only one.
 fn shared(a: &ViewSighting<'_>, b: &ViewSighting<'_>) -> (u64, u64) {
     if a.n == 0 || b.n == 0 {
         return (0, 0);

@@ -1,8 +1,8 @@
 //! Which voxels hold a surface: the opacity of all Gaussians at each voxel, by Beer and Lambert's law.
 //!
-//! `opacity = 1 - exp(-sum over Gaussians of alpha exp(-d^2 / 2))`, where d is the distance of the voxel's centre
-//! from the mean in standard deviations of the Gaussian, widened by [`VOXEL_VARIANCE`] of the voxel's edge
-//! squared; d above [`MAX_SIGMAS`] counts nothing.
+//! `opacity = 1 - exp(-sum over Gaussians of alpha exp(-d^2 / 2))`, where d is the distance of the voxel's centre from
+//! the mean in standard deviations of the Gaussian, widened by [`VOXEL_VARIANCE`] of the voxel's squared edge; d above
+//! [`MAX_SIGMAS`] counts nothing.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -18,26 +18,24 @@ use super::lattice::{BlockAt, Lattice};
 pub const MIN_OPACITY: f32 = 0.1;
 /// Distance from a mean, in standard deviations, up to which a Gaussian counts.
 pub(crate) const MAX_SIGMAS: f64 = 3.0;
-/// Variance that widens a Gaussian, in squared edges of a voxel. A surface is thinner than a voxel: without it a
-/// voxel's centre beside the surface sees nothing. With 0.15 a closed surface of opaque Gaussians that touches a
-/// corner of the voxel,
-/// 0.866 edges from its centre, still gives an opacity of 0.16.
+/// Variance that widens a Gaussian, in squared edges of a voxel: surfaces are thinner than voxels and would miss
+/// centres beside them. With 0.15, a closed opaque surface that touches a voxel's corner, 0.866 edges from its centre,
+/// still gives an opacity of 0.16.
 pub(crate) const VOXEL_VARIANCE: f64 = 0.15;
 
-/// Blocks along an edge of a tile: its sums, 1 MiB, stay in a core's cache.
+/// Blocks along a tile's edge: its sums, 1 MiB, stay in a core's cache.
 const TILE_BLOCKS: i32 = 16;
 const TILE_EDGE: usize = (TILE_BLOCKS * BLOCK_EDGE) as usize;
-/// Tiles along an axis that a Gaussian may reach into: larger ones are sky and other background that no robot
-/// drives into.
+/// Most tiles along an axis of a Gaussian: larger ones are sky and other background that no robot drives into.
 const MAX_TILES: i32 = 8;
-/// Standard deviation along its shortest axis, world units, above which a Gaussian is fog, sky or other
-/// background: the Gaussians of a surface are thin.
+/// Largest standard deviation along the shortest axis of a surface's Gaussian, world units; thicker ones are fog, sky
+/// or other background.
 const MAX_THICKNESS: f32 = 0.2;
 
 pub(super) struct Occupied {
-    /// By place: voxels of each block with at least one.
+    /// Voxels of each occupied block, by place.
     pub(super) blocks: Vec<(BlockAt, u64)>,
-    /// Gaussians left out as background: larger than 8 tiles, or thicker than [`MAX_THICKNESS`].
+    /// Left out as background: larger than 8 tiles, or thicker than [`MAX_THICKNESS`].
     pub(super) n_background: usize,
 }
 
@@ -46,7 +44,7 @@ struct Ellipsoid {
     mean: DVec3,
     /// Inverse of the widened covariance.
     precision: DMat3,
-    /// Half the edges of the box around the part that counts.
+    /// Half edges of the box around the part that counts.
     reach: DVec3,
     opacity: f64,
 }
@@ -69,13 +67,13 @@ impl Ellipsoid {
         (reach.is_finite() && precision.is_finite()).then_some(Self { mean, precision, reach, opacity })
     }
 
-    /// Returns the voxels along an axis whose centres the box holds.
+    /// Voxels along an axis with their centres in the box.
     fn voxels(&self, axis: usize) -> RangeInclusive<i64> {
         let (mean, reach) = (self.mean[axis], self.reach[axis]);
         (mean - reach - 0.5).ceil() as i64..=(mean + reach - 0.5).floor() as i64
     }
 
-    /// Returns the tiles along an axis that the box reaches; `None` if they are more than a thing has.
+    /// Tiles along an axis that the box reaches; `None` if they are too many for a thing.
     fn tiles(&self, axis: usize) -> Option<RangeInclusive<i32>> {
         let voxels = self.voxels(axis);
         // A reach beyond 64 bits saturates: the quotients' difference still fits.
@@ -84,8 +82,8 @@ impl Ellipsoid {
         (last - first < i64::from(MAX_TILES)).then_some(first as i32..=last as i32)
     }
 
-    /// Adds `alpha exp(-d^2 / 2)` to the voxels of a tile, row by row along z: where a row enters and leaves the
-    /// ellipsoid is a quadratic equation.
+    /// Adds `alpha exp(-d^2 / 2)` to a tile's voxels, row by row along z: a quadratic equation gives the row's ends in
+    /// the ellipsoid.
     fn add_to(&self, tile: [i32; 3], sums: &mut [f32]) {
         let first = tile.map(|t| i64::from(t) * TILE_EDGE as i64);
         let clipped = |axis: usize, range: RangeInclusive<i64>| {
@@ -118,7 +116,7 @@ impl Ellipsoid {
 }
 
 impl Ellipsoid {
-    /// Returns the tiles that the box reaches along each axis.
+    /// Tiles that the box reaches along each axis.
     fn reached(&self) -> Option<Reached> {
         Some([self.tiles(0)?, self.tiles(1)?, self.tiles(2)?])
     }
@@ -126,19 +124,19 @@ impl Ellipsoid {
 
 type Reached = [RangeInclusive<i32>; 3];
 
-/// Returns the bytes that the lists of [`occupied`] take at most, but for the blocks that it returns.
+/// Most bytes of [`occupied`]'s lists, without the blocks that it returns.
 pub(super) fn working_bytes(scene: &Gaussians, usable: &[u32], lattice: Lattice) -> u64 {
     let n_tiles = |index: &u32| {
         let reached = Ellipsoid::new(scene, *index as usize, lattice).and_then(|of| of.reached());
         reached.map_or(0, |reached| reached.iter().map(|along| along.clone().count() as u64).product())
     };
     let n_pairs: u64 = usable.par_iter().map(n_tiles).sum();
-    // Lists double when they are full.
+    // Lists double when full.
     (usable.len() * size_of::<Option<Reached>>()) as u64 + n_pairs * 2 * size_of::<u32>() as u64
 }
 
-/// Finds the occupied voxels. `usable`: the Gaussians to take, ascending. The result does not depend on threads: a
-/// tile belongs to one, and adds its Gaussians in their order.
+/// Finds the occupied voxels. `usable`: Gaussians, ascending. The result does not depend on threads: each tile has one
+/// thread, which adds Gaussians in their order.
 pub(super) fn occupied(scene: &Gaussians, usable: &[u32], lattice: Lattice) -> Occupied {
     let ellipsoid = |index: &u32| Ellipsoid::new(scene, *index as usize, lattice);
     let reached: Vec<Option<Reached>> = usable.par_iter().map(|index| ellipsoid(index)?.reached()).collect();
@@ -168,9 +166,8 @@ pub(super) fn occupied(scene: &Gaussians, usable: &[u32], lattice: Lattice) -> O
     Occupied { blocks, n_background }
 }
 
-/// Returns the blocks of a tile that have an occupied voxel.
 fn blocks_of(tile: [i32; 3], sums: &[f32]) -> Vec<(BlockAt, u64)> {
-    // 1 - exp(-sum) >= least, solved for the sum.
+    // 1 - exp(-sum) >= MIN_OPACITY, solved for the sum.
     let least = -(1.0 - MIN_OPACITY).ln();
     let edge = BLOCK_EDGE as usize;
     let places = (0..TILE_BLOCKS)

@@ -3,10 +3,10 @@
 use glam::DVec3;
 use slag_common::occupancy::BLOCK_EDGE;
 
-/// Farthest block that is looked at, from the world's origin: twice this distance still fits 32 bits of voxels.
+/// Farthest block from the world's origin: twice this distance still fits 32 bits of voxels.
 const MAX_BLOCK: f64 = (1u64 << 26) as f64;
 
-/// A block's place on the lattice. Ordered by x, then y, then z.
+/// Ordered by x, then y, then z.
 pub(super) type BlockAt = [i32; 3];
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -16,7 +16,7 @@ pub(super) struct Lattice {
 }
 
 impl Lattice {
-    /// Returns a point in voxels; `None` if it lies beyond the lattice.
+    /// A point in voxels; `None` beyond the lattice.
     pub(super) fn in_voxels(self, point: DVec3) -> Option<DVec3> {
         let at = point / self.voxel;
         (at.abs().max_element() < MAX_BLOCK * f64::from(BLOCK_EDGE)).then_some(at)

@@ -51,13 +51,12 @@ impl SceneOccupancy {
     }
 }
 
-/// Bytes for each place that is looked at: with what was seen there, and twice as a block, in a list of all and in that
-/// of its cell.
+/// Bytes per candidate: with what was seen there, and as a block both in the list of all and in its cell's.
 const BYTES_PER_CANDIDATE: u64 = (size_of::<Candidate>() + 2 * size_of::<Block>()) as u64;
 
 pub(crate) enum OccupancyError {
     Memory(MemoryError),
-    /// A view, by its index, cannot be drawn.
+    /// The view of this index cannot be drawn.
     View(usize, RasterError),
 }
 
@@ -67,8 +66,7 @@ impl From<MemoryError> for OccupancyError {
     }
 }
 
-/// Finds the free and occupied places of a scene from its Gaussians and the views that look at it, within `memory`;
-/// `None` if cancelled.
+/// Finds free and occupied places from a scene's Gaussians and views, within `memory`; `None` if cancelled.
 pub(crate) fn find(
     gaussians: &Gaussians,
     split: &CellSplit,

@@ -11,11 +11,10 @@ use slag_common::occupancy::Block;
 use super::lattice::Lattice;
 use crate::cells::CellSplit;
 
-/// Blocks along an edge of the groups that share a list of candidate cells.
+/// Edge, in blocks, of the groups that share a list of candidate cells.
 const GROUP_BLOCKS: i32 = 16;
 
-/// Returns the blocks of each cell: a block belongs to the cell with the box of its means nearest to the block's
-/// centre, the first of those equally near.
+/// Assigns each block to the cell whose means' box is nearest to its centre, the first of equals.
 pub(super) fn by_cell(blocks: &[Block], split: &CellSplit, lattice: Lattice) -> Vec<Vec<Block>> {
     let mut groups: BTreeMap<[i32; 3], Vec<Block>> = BTreeMap::new();
     for block in blocks {
@@ -38,8 +37,8 @@ pub(super) fn by_cell(blocks: &[Block], split: &CellSplit, lattice: Lattice) -> 
     of_cell
 }
 
-/// Returns the cells that may be the nearest of a point in a box: no farther from the box's centre than the
-/// nearest cell and twice half its diagonal.
+/// Cells that may be nearest to a point in a box: no farther from its centre than the nearest cell plus the box's
+/// diagonal.
 fn candidates(bounds: &Aabb, split: &CellSplit) -> Vec<usize> {
     let distance = |cell: usize| split.cells[cell].mean_bounds.distance_to(bounds.centre());
     let all = 0..split.cells.len();

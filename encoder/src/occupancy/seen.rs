@@ -8,53 +8,52 @@ use slag_common::occupancy::BLOCK_EDGE;
 use super::lattice::{BlockAt, Lattice};
 use crate::raster::{Drawing, RasterView};
 
-/// Views that must have looked through a voxel for it to be free: one may look through a hole in the splat.
+/// Views that must look through a free voxel: one may look through a hole in the splat.
 pub(crate) const MIN_VIEWS: u32 = 2;
 /// Width of the depth pictures, pixels: at 60 degrees and 8 m a pixel is 3 cm wide.
 pub(super) const DEPTH_WIDTH_PX: u32 = 320;
-/// Height above an occupied voxel up to which places are looked at, world units: a robot with its load.
+/// Height above an occupied voxel up to which places are examined, world units: a robot with its load.
 const HEADROOM: f64 = 2.4;
-/// Opacity of a pixel from which its depth is a surface's.
+/// Least opacity of a pixel whose depth is a surface's.
 const MIN_COVERAGE: f32 = 0.5;
-/// Opacity of a pixel up to which nothing is in its way.
+/// Largest opacity of a pixel with nothing in its way.
 const MAX_SKY: f32 = 0.1;
-/// Nearest depth at which a voxel is looked for, world units.
+/// Nearest depth of an examined voxel, world units.
 const NEAR: f64 = 0.01;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Candidate {
     pub(super) at: BlockAt,
     pub(super) occupied: u64,
-    /// Voxels that at least one view has looked through.
+    /// Voxels that a view looks through.
     once: u64,
-    /// Voxels that at least [`MIN_VIEWS`] views have looked through.
+    /// Voxels that at least [`MIN_VIEWS`] views look through.
     pub(super) seen: u64,
 }
 
-/// Yields the blocks with an occupied voxel and those above them up to the headroom, by place. `occupied`: by place.
+/// Blocks with an occupied voxel, and those above them up to the headroom, by place. `occupied`: by place.
 pub(super) fn candidates(occupied: &[(BlockAt, u64)], lattice: Lattice) -> impl Iterator<Item = Candidate> {
     let above = (HEADROOM / lattice.block()).ceil() as i32;
     let with_next = occupied.iter().zip(occupied.iter().skip(1).map(Some).chain([None]));
     with_next.flat_map(move |((at, mask), next)| {
         let block = |z: i32, occupied| Candidate { at: [at[0], at[1], z], occupied, once: 0, seen: 0 };
-        // Blocks of a column follow each other.
+        // Blocks of a column are consecutive.
         let limit = next.filter(|(next, _)| next[..2] == at[..2]).map_or(i32::MAX, |(next, _)| next[2]);
         let higher = at[2] + 1..limit.min(at[2] + above + 1);
         std::iter::once(block(at[2], *mask)).chain(higher.map(move |z| block(z, 0)))
     })
 }
 
-/// A depth picture: how far each pixel looks.
 pub(super) struct Depth {
     view: RasterView,
-    /// Camera z up to which the pixel looks through, row-major; infinite where only sky is.
+    /// Camera z up to which the pixel looks through, row-major; infinite for sky.
     until: Vec<f32>,
 }
 
 impl Depth {
-    /// Takes the depth of each pixel. At the edge of a surface it lies between that surface and the one behind it,
-    /// so such a pixel may look through what the nearer surface hides. It is one pixel wide, voxels with a surface
-    /// are occupied in any case, and two views must agree.
+    /// Takes each pixel's depth. At a surface's edge it lies between that surface and the one behind, so the pixel may
+    /// look through what is hidden; but it is one pixel wide, voxels with a surface are occupied anyway, and two views
+    /// must agree.
     pub(super) fn new(view: RasterView, drawing: &Drawing) -> Self {
         let of_pixel = |pixel: usize| match drawing.coverage[pixel] {
             coverage if coverage >= MIN_COVERAGE => drawing.depth[pixel],
@@ -65,7 +64,7 @@ impl Depth {
         Self { view, until }
     }
 
-    /// Notes the voxels of the candidates that this view looks through. The order of views does not matter.
+    /// Marks the candidates' voxels that this view looks through; the order of views does not matter.
     pub(super) fn look(&self, lattice: Lattice, candidates: &mut [Candidate]) {
         candidates.par_chunks_mut(1024).for_each(|chunk| {
             chunk.iter_mut().for_each(|candidate| {
@@ -88,7 +87,7 @@ impl Depth {
         if centre.z + radius < NEAR {
             return 0;
         }
-        // Bounds of the block's ball on the image: the ball's slope from the axis, widened by its angle.
+        // Bounds of the block's sphere on the image: the sphere's slope from the axis, widened by its angle.
         if centre.z > radius {
             let beyond = |at: f64, focal: f64, low: f64, high: f64| {
                 let reach = radius * (1.0 + (at / centre.z).abs()) / (centre.z - radius);

@@ -26,8 +26,7 @@ fn reference_of(manifest: &Manifest) -> Result<&GeoReference, GeographicError> {
     manifest.geo_reference.as_ref().ok_or(GeographicError::NotGeoReferenced)
 }
 
-/// Returns a geographic position in the world frame, metres. Without a height, the position has the height
-/// of the world frame's origin.
+/// A geographic position in the world frame, metres. Without a height, that of the world frame's origin.
 pub(crate) fn world_from_geographic(
     manifest: &Manifest,
     latitude_deg: f64,
@@ -48,23 +47,21 @@ pub(crate) fn world_from_geographic(
     Ok(reference.world_from_geographic(Geographic { latitude_deg, longitude_deg, height_m }))
 }
 
-/// A piece of the earth's surface.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Footprint {
-    /// Degrees of longitude and latitude. Rings are closed and counter-clockwise. A shape across the
-    /// antimeridian is cut in two (RFC 7946, 3.1.9); a shape around a pole becomes the band of latitudes
-    /// that covers it.
+    /// Degrees of longitude and latitude. Rings are closed and counter-clockwise. A shape across the antimeridian is
+    /// cut in two (RFC 7946, 3.1.9); one around a pole becomes the band of latitudes that covers it.
     pub polygons: MultiPolygon,
     /// Geodesic area on the WGS 84 ellipsoid.
     pub(crate) area_m2: f64,
 }
 
-/// Returns the footprint of a box, at half its height.
+/// Footprint of a box, at half its height.
 pub(crate) fn footprint(bounds: &Aabb, reference: &GeoReference) -> Footprint {
     Footprint::of_ring(&rectangle(bounds), bounds.centre().z, reference)
 }
 
-/// Returns the convex hull of all cells' rectangles; empty without cells.
+/// Convex hull of all cells' rectangles; empty without cells.
 pub fn outline(manifest: &Manifest, reference: &GeoReference) -> Footprint {
     let corners = manifest.cells.iter().flat_map(|cell| rectangle(&cell.bounds)).map(Point::from);
     let hull = MultiPoint::from_iter(corners).convex_hull();
@@ -75,14 +72,14 @@ pub fn outline(manifest: &Manifest, reference: &GeoReference) -> Footprint {
     Footprint::of_ring(corners, mean_height, reference)
 }
 
-/// Returns the corners of a box seen from above, counter-clockwise, world frame.
+/// Corners of a box seen from above, counter-clockwise, world frame.
 fn rectangle(bounds: &Aabb) -> [Coord; 4] {
     let (min, max) = (bounds.min, bounds.max);
     [(min.x, min.y), (max.x, min.y), (max.x, max.y), (min.x, max.y)].map(Coord::from)
 }
 
 impl Footprint {
-    /// Projects a counter-clockwise ring (not closed) at height `z` of the world frame.
+    /// Takes a counter-clockwise open ring at height `z` of the world frame.
     fn of_ring(ring_in_world: &[Coord], z: f64, reference: &GeoReference) -> Self {
         let mut ring: Vec<Coord> = Vec::with_capacity(ring_in_world.len());
         for corner in ring_in_world {
@@ -91,7 +88,7 @@ impl Footprint {
             let near = ring.last().map_or(place.longitude_deg, |last| last.x);
             ring.push(Coord { x: nearest_turn(place.longitude_deg, near), y: place.latitude_deg });
         }
-        // The area of the uncut ring: the parallel that bounds a band is not a geodesic.
+        // Of the uncut ring: the parallel that bounds a band is no geodesic.
         let area_m2 = closed(ring.clone()).geodesic_area_unsigned();
         Self { polygons: MultiPolygon(polygons(ring)), area_m2 }
     }
@@ -113,12 +110,12 @@ fn polygons(ring: Vec<Coord>) -> Vec<Polygon> {
     parts.into_iter().filter(|part| part.len() > 2).map(closed).collect()
 }
 
-/// Returns the longitude plus the whole turns that bring it nearest to another.
+/// Adds the whole turns that bring a longitude nearest to another.
 fn nearest_turn(longitude_deg: f64, near_deg: f64) -> f64 {
     longitude_deg + 360.0 * ((near_deg - longitude_deg) / 360.0).round()
 }
 
-/// Returns the part of a convex ring with `side * longitude <= 180` (Sutherland and Hodgman 1974).
+/// Part of a convex ring with `side * longitude <= 180` (Sutherland and Hodgman 1974).
 fn clip(ring: Vec<Coord>, side: f64) -> Vec<Coord> {
     let mut kept = Vec::with_capacity(ring.len() + 2);
     for (i, &to) in ring.iter().enumerate() {
@@ -135,7 +132,7 @@ fn clip(ring: Vec<Coord>, side: f64) -> Vec<Coord> {
     kept
 }
 
-/// Returns the band of latitudes from a ring's corner nearest to the equator to the enclosed pole.
+/// Latitudes from a ring's corner nearest to the equator up to the enclosed pole.
 fn polar_band(ring: &[Coord]) -> Polygon {
     let nearest = ring.iter().map(|corner| corner.y.abs()).fold(90.0, f64::min);
     let north = ring[0].y > 0.0;
@@ -153,10 +150,8 @@ fn closed(ring: Vec<Coord>) -> Polygon {
     Polygon::new(ring, vec![])
 }
 
-/// Returns the footprints of a scene's cells as GeoJSON: one feature a cell, with `cell_id`,
-/// `n_gaussians` and `area_m2` (geodesic, on the WGS 84 ellipsoid).
-///
-/// The foreign member `scene` has the name, the generation, and the convex `outline` of all cells.
+/// Footprints of a scene's cells as GeoJSON: one feature per cell, with `cell_id`, `n_gaussians` and `area_m2`
+/// (geodesic, WGS 84). The foreign member `scene` has the name, the generation, and the convex `outline` of all cells.
 pub fn coverage(manifest: &Manifest) -> Result<FeatureCollection, GeographicError> {
     let reference = reference_of(manifest)?;
     let features = manifest.cells.iter().map(|cell| {

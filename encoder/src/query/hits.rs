@@ -13,7 +13,7 @@ use slag_common::splat::ply::{Point, PointProperties};
 use super::{QueryError, Scores};
 use crate::store::{StoreReader, StoredShard};
 
-/// Largest f32 rounding of a coordinate, relative to it: splat files keep means in f32.
+/// Largest relative f32 rounding of a coordinate: splat files keep means in f32.
 const F32_ROUNDING: f64 = 1e-7;
 
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -24,7 +24,7 @@ pub struct Hit {
     pub position_in_world: DVec3,
 }
 
-/// A splat is not the one that a store was encoded from.
+/// The splat is not the one that the store was encoded from.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneMismatch {
     #[error("the splat has {found} Gaussians, the store was encoded from one of {expected}; give that splat")]
@@ -36,14 +36,14 @@ pub enum SceneMismatch {
 }
 
 impl Scores {
-    /// Returns the `n` best Gaussians, best first: by cosine, then by index.
+    /// The `n` best, by cosine, then by index.
     pub fn best(&self, n: usize) -> Vec<u32> {
         let mut order = self.matching(f32::NEG_INFINITY);
         order.truncate(n);
         order
     }
 
-    /// Returns the Gaussians with cosines at or above a threshold, best first: by cosine, then by index.
+    /// Gaussians at or above a threshold, best first: by cosine, then by index.
     pub fn matching(&self, threshold: f32) -> Vec<u32> {
         // NaN compares false: a Gaussian without evidence matches nothing.
         let mut order: Vec<u32> =
@@ -54,8 +54,8 @@ impl Scores {
     }
 }
 
-/// Returns Gaussians of the input with their positions, in the order given. Those that no shard knows the index of
-/// are left out; a scene encoded with exact shards or input indices has none.
+/// Input Gaussians with their positions, in the given order. Leaves out those whose index no shard knows; a scene with
+/// exact shards or input indices has none of these.
 pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result<Vec<Hit>, QueryError> {
     let mut positions: HashMap<u32, Option<DVec3>> = indices.iter().map(|index| (*index, None)).collect();
     if positions.is_empty() {
@@ -77,7 +77,6 @@ pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result
     Ok(indices.iter().filter_map(hit).collect())
 }
 
-/// Returns the smallest shard of a cell that knows the indices of its Gaussians.
 fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<StoredShard>, QueryError> {
     for record in Profile::ALL.iter().filter_map(|profile| cell.shards.get(profile)) {
         let shard = reader.read_shard(record)?;
@@ -88,8 +87,7 @@ fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<Store
     Ok(None)
 }
 
-/// Checks that a splat is the one that a store was encoded from: by its number of Gaussians, and by the positions
-/// of some.
+/// Fails unless a store was encoded from this splat: compares its number of Gaussians, and some positions.
 pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Result<(), SceneMismatch> {
     let manifest = reader.manifest();
     let expected = manifest.n_gaussians + manifest.n_rejected;
@@ -101,7 +99,7 @@ pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Res
     for Hit { index, position_in_world: expected, .. } in hits {
         let found = scene.means_in_world[*index as usize];
         let rounding = F32_ROUNDING * expected.abs().max_element();
-        // `NaN <= x` is false: it matches nothing.
+        // `NaN <= x` is false: NaN matches nothing.
         let is_same = (found - *expected).abs().max_element() <= 1.01 * error + rounding;
         if !is_same {
             return Err(SceneMismatch::Position { index: *index, expected: *expected, found });
@@ -110,7 +108,7 @@ pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Res
     Ok(())
 }
 
-/// Returns Gaussians as a PLY of points; the answer of each is its rank.
+/// A PLY of points with their ranks as answers.
 pub(crate) fn points_ply(hits: &[Hit], comments: &[String]) -> Vec<u8> {
     let properties = PointProperties { question: false, shard_index: false, input_index: true };
     let mut file = properties.header(hits.len() as u64, comments).into_bytes();

@@ -25,7 +25,7 @@ pub struct AdapterReport {
 }
 
 impl AdapterReport {
-    /// Returns whether a software adapter (llvmpipe, WARP) does the work on the CPU.
+    /// Software adapters (llvmpipe, WARP) run on the CPU.
     pub fn is_software(&self) -> bool {
         self.kind == "software"
     }
@@ -33,14 +33,13 @@ impl AdapterReport {
 
 #[derive(Clone, Copy, Debug)]
 pub struct GpuOptions {
-    /// Upper limit for a buffer, bytes; the limit of the device applies as well.
+    /// Largest buffer, bytes; the device's own limit applies as well.
     pub max_binding_bytes: u64,
-    /// Upper limit for the part of the scene that stays on the device, bytes; the rest is uploaded for each view.
+    /// Most bytes of the scene that stay on the device; the rest is uploaded for each view.
     pub max_resident_bytes: u64,
-    /// Initial capacity for visible Gaussians, pairs and contributions; it grows when a view needs more.
+    /// Initial capacity for visible Gaussians, pairs and contributions; grows as needed.
     pub first_capacity: u32,
-    /// Views processed at once, fewer where the device's memory does not suffice: while one is copied back, others
-    /// compute.
+    /// Concurrent views, fewer if the device's memory does not suffice: while one is copied back, others compute.
     pub views_in_flight: usize,
 }
 

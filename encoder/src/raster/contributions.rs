@@ -9,11 +9,11 @@ use slag_raster::{Buckets, Lanes, ScreenGaussian, TileRect, Tiles, WeightSink, c
 use super::rasterizer::RegionWeight;
 use crate::masks::{NO_REGION, RegionMap};
 
-/// Units of a fixed-point weight per pixel.
+/// Fixed-point units per pixel of weight.
 const FIXED_UNITS: f64 = (1_u64 << SUM_FRACTION_BITS) as f64;
 
-/// Sums of a tile's weights in `f64` are exact in any order. A weight is at least 2^-22, hence a multiple of
-/// 2^-45, and the sum of 256 weights fits 53 bits.
+/// Sums of a tile's weights in `f64` are exact in any order: a weight is at least 2^-22, hence a multiple of 2^-45, and
+/// the sum of 256 weights fits 53 bits.
 const _: () = {
     assert!(MIN_ALPHA as f64 * MIN_TRANSMITTANCE as f64 > 1.0 / (1 << 22) as f64);
     assert!(TILE_SIZE_PX * TILE_SIZE_PX <= 1 << 8);
@@ -24,14 +24,14 @@ pub(crate) struct TileContribution {
     /// Index into the visible Gaussians.
     member: u32,
     region: u32,
-    /// Weight in units of `2^-SUM_FRACTION_BITS`, so that addition is exact in any order.
+    /// In units of `2^-SUM_FRACTION_BITS`, so that addition is exact in any order.
     fixed: u64,
 }
 
 /// Visible Gaussians per task of [`merge`]; their counts fit the cache.
 const RANGE: usize = 1 << 13;
 
-/// Returns the contributions within each tile: for each row of tiles, one bucket per range of Gaussians.
+/// Contributions within each tile: for each row of tiles, one bucket per range of Gaussians.
 pub(crate) fn tile_contributions(
     visible: &[ScreenGaussian],
     tiles: &Tiles,
@@ -64,7 +64,7 @@ pub(crate) fn tile_contributions(
         .collect()
 }
 
-/// Sums contributions over all tiles. Returns those above zero, ordered by (Gaussian, region).
+/// Sums contributions over all tiles; returns positive ones by (Gaussian, region).
 pub(crate) fn merge(visible: &[ScreenGaussian], rows: &[Buckets<TileContribution>]) -> Vec<RegionWeight> {
     let parts: Vec<Vec<RegionWeight>> = visible
         .par_chunks(RANGE)
@@ -77,14 +77,13 @@ pub(crate) fn merge(visible: &[ScreenGaussian], rows: &[Buckets<TileContribution
     concat(&parts)
 }
 
-/// Sums the contributions of the visible Gaussians from `first` on.
+/// For the visible Gaussians from `first` on.
 fn merge_range(
     visible: &[ScreenGaussian],
     first: usize,
     by_row: &[&[TileContribution]],
 ) -> Vec<RegionWeight> {
-    // A counting sort groups the few contributions of each Gaussian; only within a group they are sorted by
-    // region.
+    // A counting sort groups each Gaussian's few contributions; only within a group they are sorted by region.
     let mut ends = vec![0_usize; visible.len()];
     for of_tile in by_row.iter().copied().flatten() {
         ends[of_tile.member as usize - first] += 1;
@@ -117,29 +116,27 @@ fn merge_range(
     entries
 }
 
-/// The pixels of a region in a row of a tile.
 struct Part {
-    /// Index into the regions of the tile.
+    /// Index into the tile's regions.
     slot: usize,
-    /// All bits are set at the pixels of the region.
+    /// All bits set at the region's pixels.
     mask: [u32; TILE_SIZE_PX],
 }
 
-/// Sums weights per region of a tile.
 struct RegionSink {
     regions: Vec<u32>,
-    /// The regions of row `y` are `parts[first_part[y]..first_part[y + 1]]`.
+    /// Row `y` has the parts `first_part[y]..first_part[y + 1]`.
     parts: Vec<Part>,
     first_part: [usize; TILE_SIZE_PX + 1],
-    /// Weights of the current Gaussian, per slot and column.
+    /// Of the current Gaussian, per slot and column.
     weights: Vec<[f64; TILE_SIZE_PX]>,
-    /// Slots that the current Gaussian touches, one bit each.
+    /// Slots touched by the current Gaussian, one bit each.
     touched: [u64; TILE_SIZE_PX * TILE_SIZE_PX / 64],
     contributions: Vec<TileContribution>,
 }
 
 impl RegionSink {
-    /// Assigns slots to the regions of a tile; `None` if no pixel has a region.
+    /// `None` if no pixel of the tile has a region.
     fn new(map: &RegionMap, rect: TileRect) -> Option<Self> {
         let row_of = |y: usize| {
             let start = (rect.y_px + y) * map.width_px as usize + rect.x_px;
@@ -206,7 +203,7 @@ impl WeightSink for RegionSink {
                 }
                 let weight = simd.reduce_sum_f64s(sum);
                 if weight > 0.0 {
-                    // Rounds: the weight and the half together need fewer than 53 bits.
+                    // Rounds: weight and half together need fewer than 53 bits.
                     let fixed = (weight * FIXED_UNITS + 0.5) as u64;
                     let region = self.regions[slot];
                     self.contributions.push(TileContribution { member, region, fixed });
@@ -252,8 +249,8 @@ mod tests {
         RegionMap { width_px: WIDTH_PX, height_px: HEIGHT_PX, region_of_pixel, n_regions }
     }
 
-    /// A contribution to a region and the sum over its parts differ only by the rounding of each part to 2^-32.
-    /// Otherwise a mask, which is a union of regions, would depend on the other masks that divide it.
+    /// A region's contribution and the sum over its parts differ only by each part's rounding to 2^-32. Otherwise a
+    /// mask, a union of regions, would depend on the masks that divide it.
     #[test]
     fn contributions_add_up_within_their_last_bit() {
         let (visible, tiles) = scene(200, 0.3);
@@ -275,11 +272,10 @@ mod tests {
         }
     }
 
-    /// Compares all instruction sets of this processor on different region maps: one region, stripes with gaps, a
-    /// region per pixel.
+    /// All instruction sets of this processor on one region, stripes with gaps, and a region per pixel.
     #[test]
     fn all_instruction_sets_give_the_same_bits() {
-        // Opaque ones, and more Gaussians than a range of `merge`, through which one sees.
+        // Opaque ones, and transparent ones that exceed a range of `merge`.
         let scenes = [scene(500, 0.3), scene(RANGE as u32 + 100, 0.01)];
         let maps = [
             map(1, |_| 0),

@@ -9,13 +9,13 @@ use super::rasterizer::{LoadedScene, RasterError, Rasterizer, ViewWeights};
 use crate::masks::{NO_REGION, RegionMap};
 use crate::memory::{MemoryPlan, Phase};
 
-/// Reserves what a loaded scene keeps besides its Gaussians.
+/// What a loaded scene keeps besides its Gaussians.
 pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     let bytes = n_gaussians * PreparedScene::BYTES_PER_GAUSSIAN;
     memory.reserve(Phase::Views, "the size of each Gaussian", bytes as u64);
 }
 
-/// The reference backend. It runs on the current rayon pool, with the widest instruction set available.
+/// Reference backend on the current rayon pool, with the widest available instruction set.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct CpuRasterizer;
 
@@ -30,7 +30,6 @@ impl Rasterizer for CpuRasterizer {
     }
 }
 
-/// A validated scene and the instruction set for its pixels.
 struct CpuScene<'s> {
     prepared: PreparedScene<'s>,
     instructions: InstructionSet,
@@ -54,7 +53,7 @@ impl LoadedScene for CpuScene<'_> {
     }
 }
 
-/// Checks that a region map has the size of the view and no region number out of range.
+/// The region map must have the view's size, and no region number out of range.
 pub(super) fn check_regions(regions: &RegionMap, intrinsics: &Intrinsics) -> Result<(), RasterError> {
     let expected_px = [intrinsics.width_px, intrinsics.height_px];
     let found_px = [regions.width_px, regions.height_px];

@@ -75,14 +75,13 @@ pub enum DeviceError {
     Unfit(#[from] RasterError),
 }
 
-/// A backend that distributes views over several devices.
 pub struct Devices {
     pub gpus: Vec<GpuRasterizer>,
     views_in_flight: usize,
 }
 
 impl Devices {
-    /// Opens the chosen devices. Devices that fail are logged and left out.
+    /// Opens the chosen devices; those that fail are logged and left out.
     pub fn open(choice: &DeviceChoice, options: GpuOptions) -> Result<Self, DeviceError> {
         let views_in_flight = options.views_in_flight.max(1);
         let all = if *choice == DeviceChoice::Cpu { Vec::new() } else { adapters() };
@@ -97,8 +96,7 @@ impl Devices {
                 chosen.map(|(_, adapter)| adapter).collect()
             }
             DeviceChoice::Auto | DeviceChoice::Gpu => {
-                // A GPU appears once per graphics interface; within the interface of the best adapter, GPUs are
-                // distinct.
+                // A GPU appears once per graphics interface; within the best adapter's interface, GPUs are distinct.
                 let backend = all.first().map(|a| a.report.backend.clone());
                 let (software, hardware): (Vec<Adapter>, Vec<Adapter>) = all
                     .into_iter()
@@ -153,7 +151,7 @@ impl Devices {
 }
 
 impl Rasterizer for Devices {
-    /// Views go to any of the GPUs: another set of kinds mixes other bits.
+    /// Any GPU may take a view, so another set of kinds gives other bits.
     fn identity(&self) -> String {
         let kinds: BTreeSet<String> = self.gpus.iter().map(Rasterizer::identity).collect();
         if kinds.is_empty() { CpuRasterizer.identity() } else { Vec::from_iter(kinds).join(", ") }
@@ -184,18 +182,18 @@ impl Rasterizer for Devices {
     }
 }
 
-/// A scene on several GPUs. Each GPU has a lane per view in flight, so a slow view occupies only its own.
+/// A scene on several GPUs, each with a lane per view in flight, so a slow view occupies only its own.
 struct SharedScene<'s> {
     gpus: Vec<Box<dyn LoadedScene + 's>>,
     views_in_flight: usize,
     cpu: Box<dyn LoadedScene + 's>,
     lanes: Lanes<()>,
-    /// Whether it was said that the CPU does what no GPU can.
+    /// Whether the fallback to the CPU was reported.
     is_told: AtomicBool,
 }
 
 impl SharedScene<'_> {
-    /// Runs work on the next free GPU; if it fails, on another GPU, and finally on the CPU.
+    /// Runs work on the next free GPU; if it fails, on another, and finally on the CPU.
     fn run<T>(&self, work: impl Fn(&dyn LoadedScene) -> Result<T, RasterError>) -> Result<T, RasterError> {
         while let Some(lane) = self.lanes.take_if_any() {
             match work(self.gpus[lane.gpu() as usize].as_ref()) {
@@ -235,7 +233,7 @@ impl LoadedScene for SharedScene<'_> {
 mod tests {
     use super::*;
 
-    /// With one lane, the view after one that panicked waits for ever unless the lane is given back.
+    /// With one lane, the view after a panic would wait for ever unless the lane is given back.
     #[test]
     fn a_panic_gives_its_lane_back() {
         let gaussians = Gaussians::default();

@@ -17,7 +17,7 @@ pub struct Device {
     none: Infallible,
 }
 
-/// The GPU backend; it cannot be made.
+/// The GPU backend, which cannot be made.
 pub struct GpuRasterizer {
     none: Infallible,
 }

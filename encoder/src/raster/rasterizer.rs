@@ -5,23 +5,22 @@ use slag_raster::{Drawing, InputError, RasterView, ViewCounters};
 
 use crate::masks::RegionMap;
 
-/// The GPUs that rasterise a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpuSlots {
     pub(crate) n_gpus: usize,
-    /// Views that each of them works on at once.
+    /// Concurrent views per GPU.
     pub views_in_flight: usize,
 }
 
 impl GpuSlots {
-    /// Returns the number of views that all of them work on at once.
+    /// Concurrent views on all GPUs.
     pub fn n_views(self) -> usize {
         self.n_gpus * self.views_in_flight
     }
 }
 
 pub trait Rasterizer: Send + Sync {
-    /// Returns a text that differs where contributions differ in their last bits.
+    /// Differs between rasterisers whose contributions differ in their last bits.
     fn identity(&self) -> String;
 
     /// Prepares a scene: validates it and, on a device with its own memory, uploads it.
@@ -30,7 +29,7 @@ pub trait Rasterizer: Send + Sync {
     /// [`RasterError`] for an inconsistent scene. Individual unusable Gaussians are counted instead.
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError>;
 
-    /// Rasterises one view of a scene; see [`LoadedScene::weights`].
+    /// See [`LoadedScene::weights`].
     fn weights(
         &self,
         scene: &Gaussians,
@@ -40,7 +39,7 @@ pub trait Rasterizer: Send + Sync {
         self.load(scene)?.weights(view, regions)
     }
 
-    /// Draws one view of a scene; see [`LoadedScene::draw`].
+    /// See [`LoadedScene::draw`].
     fn draw(
         &self,
         scene: &Gaussians,
@@ -53,16 +52,14 @@ pub trait Rasterizer: Send + Sync {
 
 /// A scene prepared by a backend; several threads may rasterise views at once.
 pub trait LoadedScene: Send + Sync {
-    /// Returns the contribution of each Gaussian to each region.
-    ///
-    /// Pixels of [`NO_REGION`](crate::masks::NO_REGION) are blended but not recorded. The same input gives the
-    /// same bits for any number of threads.
+    /// Contribution of each Gaussian to each region. Pixels of [`NO_REGION`](crate::masks::NO_REGION) are blended but
+    /// not recorded. The same input gives the same bits for any number of threads.
     fn weights(&self, view: &RasterView, regions: &RegionMap) -> Result<ViewWeights, RasterError>;
 
     /// Draws the scene over a background colour, in the colour space of its training.
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
 
-    /// Returns the GPUs that rasterise; `None` if views are rasterised on the caller's threads.
+    /// `None` if views are rasterised on the caller's threads.
     fn gpus(&self) -> Option<GpuSlots> {
         None
     }
@@ -88,8 +85,8 @@ pub enum RasterError {
     Region { pixel: usize, found: u32, n_regions: u32 },
 }
 
-/// Contribution of a Gaussian to a region: `alpha * T`, its part of a pixel attenuated by the Gaussians in front of
-/// it, summed over the pixels.
+/// A Gaussian's contribution to a region: `alpha * T`, its part of a pixel attenuated by the Gaussians in front, summed
+/// over the pixels.
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Zeroable)]
 pub struct RegionWeight {
     pub gaussian: u32,
@@ -100,7 +97,7 @@ pub struct RegionWeight {
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ViewWeights {
-    /// Contributions above zero, ordered by (Gaussian, region); each pair occurs once.
+    /// Positive, ordered by (Gaussian, region); each pair occurs once.
     pub entries: Vec<RegionWeight>,
     pub counters: ViewCounters,
 }

@@ -108,7 +108,7 @@ fn masks(page: &mut Page, recorded: &Recorded) {
     }
 }
 
-/// `found`: what the summary's JSON says of them.
+/// `found`: the objects in the summary's JSON.
 fn objects(page: &mut Page, summary: &EncodeSummary, recorded: &Recorded, found: &Value) {
     page.heading("Objects");
     match summary.objects.as_ref().map(|found| found.n_objects) {
@@ -132,7 +132,7 @@ fn row_of(object: &FoundObject) -> Vec<String> {
     vec![id.clone(), numbers(*position_m), numbers(size), n_gaussians, n_masks, photo.clone()]
 }
 
-/// Returns a row a profile: name, bytes, mean and largest relative error.
+/// A row per profile: name, bytes, mean and largest relative error.
 fn profiles(summary: &EncodeSummary, bytes: &Value) -> Vec<Vec<String>> {
     let row = |(profile, bytes): (&String, &Value)| {
         let errors = || summary.cells.iter().filter_map(|cell| Some((cell, *cell.score_error.get(profile)?)));
@@ -147,7 +147,7 @@ fn profiles(summary: &EncodeSummary, bytes: &Value) -> Vec<Vec<String>> {
 const WIDTH: f64 = 640.0;
 const MARGIN: f64 = 12.0;
 
-/// Draws the map: x to the right, y up.
+/// The map: x to the right, y up.
 fn map_svg(recorded: &Recorded) -> String {
     let corners = recorded.cells.iter().flat_map(|cell| [cell.min, cell.max]);
     let points: Vec<DVec3> =
@@ -186,7 +186,7 @@ fn map_svg(recorded: &Recorded) -> String {
     out
 }
 
-/// Returns the colour of a view, the darker the more masks it has, and what is said of it.
+/// Colour of a view, darker with more masks, and its tooltip.
 fn look(view: &RecordedView, most: f64) -> (String, String) {
     match (&view.reason, view.n_masks) {
         (Some(reason), _) => ("#d33".into(), format!("left out, {reason}")),

@@ -12,25 +12,25 @@ use slag_common::frames::Aabb;
 
 use crate::progress::{FoundObject, Progress};
 
-/// Pictures of masks in a report, evenly spread over the views.
+/// Pictures of masks, evenly spread over the views.
 const N_PICTURES: usize = 12;
 const JPEG_QUALITY: u8 = 80;
 
 pub(super) struct RecordedView {
     pub(super) name: String,
     pub(super) position_in_world: DVec3,
-    /// Masks, once they are found.
+    /// Once found.
     pub(super) n_masks: Option<usize>,
     pub(super) reason: Option<String>,
-    /// Its masks drawn over the photo, JPEG.
+    /// Masks drawn over the photo, JPEG.
     pub(super) picture: Option<Vec<u8>>,
 }
 
 #[derive(Default)]
 pub(super) struct Recorded {
-    /// In the order in which they are taken.
+    /// In the order of work.
     pub(super) views: Vec<RecordedView>,
-    /// Places in `views`, by name.
+    /// Index in `views`, by name.
     place_of_view: BTreeMap<String, usize>,
     pub(super) cells: Vec<Aabb>,
     pub(super) objects: Vec<FoundObject>,
@@ -42,14 +42,13 @@ impl Recorded {
     }
 }
 
-/// Records the progress of an encode for its report, and passes it on.
 pub(crate) struct Recorder<'a> {
     shown: &'a dyn Progress,
     recorded: Mutex<Recorded>,
 }
 
 impl<'a> Recorder<'a> {
-    /// `shown`: what else receives the progress.
+    /// `shown`: the other receiver of the progress.
     pub(crate) fn new(shown: &'a dyn Progress) -> Self {
         Self { shown, recorded: Mutex::default() }
     }
@@ -118,7 +117,7 @@ impl Progress for Recorder<'_> {
         }
     }
 
-    /// Keeps the objects, the largest first.
+    /// Keeps the largest objects first.
     fn objects(&self, objects: &mut dyn Iterator<Item = FoundObject>) {
         let mut objects: Vec<FoundObject> = objects.collect();
         objects.sort_by(|a, b| b.n_gaussians.cmp(&a.n_gaussians).then_with(|| a.id.cmp(&b.id)));
@@ -130,7 +129,7 @@ impl Progress for Recorder<'_> {
 mod tests {
     use super::*;
 
-    /// By hand: of 30 views every third has a picture, of 5 all.
+    /// By hand: every third of 30 views has a picture, and all of 5.
     #[test]
     fn pictures_are_spread_over_the_views() {
         let of = |n: usize| (0..n).filter(|at| has_picture(*at, n)).collect::<Vec<_>>();

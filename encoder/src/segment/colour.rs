@@ -2,7 +2,6 @@
 
 use image::RgbImage;
 
-/// Returns the perceived difference of two colours.
 pub(super) fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     let [l, m, n] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
     (l * l + m * m + n * n).sqrt()
@@ -27,7 +26,7 @@ pub(super) fn lab_of(image: &RgbImage) -> Vec<[f32; 3]> {
     image.pixels().map(lab).collect()
 }
 
-/// Smooths with a Gaussian truncated at four standard deviations; border pixels are repeated outwards.
+/// Gaussian truncated at four standard deviations; border pixels are repeated outwards.
 pub(super) fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
     let radius = (4.0 * sigma_px).ceil().clamp(0.0, 64.0) as usize;
     if radius == 0 || width == 0 {
@@ -38,7 +37,7 @@ pub(super) fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
     let sum: f32 = kernel.iter().sum();
     kernel.iter_mut().for_each(|weight| *weight /= sum);
 
-    // Along rows, then along columns. Sums run over whole rows at once, so that they need no pixel by itself.
+    // Along rows, then along columns; sums run over whole rows, so that no pixel is handled alone.
     let height = lab.len() / width;
     let add = |sums: &mut [[f32; 3]], weight: f32, colours: &[[f32; 3]]| {
         let (sums, colours) = (sums.as_flattened_mut().iter_mut(), colours.as_flattened());

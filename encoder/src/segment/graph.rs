@@ -25,21 +25,21 @@ use super::support;
 use crate::masks::regions::nearest;
 use crate::masks::{Bits, BoxPx, Mask, NO_REGION, masks_of_labels};
 
-/// Steps of an edge weight per unit of L*a*b* distance; 16 bits then exceed the distance from black to white.
+/// Edge weight per unit of L*a*b* distance; 16 bits then exceed the distance from black to white.
 const WEIGHT_STEPS: f32 = 200.0;
-/// Inverse of the least share of a component's pixels that are surrounded by the component: it is a third for a
-/// strip 3 px wide, and almost zero for a ring around an object.
+/// A component needs one surrounded pixel in this many. A strip 3 px wide has a third, a ring around an object almost
+/// none.
 const MIN_SURROUNDED: u32 = 8;
-/// Smallest mask, pixels of the working image: a JPEG block, the size of its artefacts.
+/// Pixels of the working image: a JPEG block, the size of its artefacts.
 const MIN_AREA_PX: u32 = 64;
 /// Scale of observation of small things, finer than all levels: only its compact components are masks.
 const COMPACT_SCALE: f32 = 100.0;
 /// A compact component fills this share of its box, is at most this share of the photo, and touches no edge of it.
 const MIN_FILL: f32 = 0.65;
 const MAX_COMPACT_SHARE: f32 = 0.03;
-/// Boundaries along its outline that suffice for a compact component.
+/// Predicted boundary along its outline that suffices for a compact component.
 const COMPACT_SUPPORT: f32 = 0.3;
-/// The neighbours to which a pixel has an edge; the other four have an edge to the pixel.
+/// Neighbours to which a pixel has an edge: half of the 8-neighbourhood; the rest by symmetry.
 const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (-1, 1), (0, 1), (1, 1)];
 
 #[derive(Clone, Debug, PartialEq)]
@@ -57,12 +57,12 @@ pub struct GraphSettings {
     pub boundary_weight: f32,
     /// Weight of a jump to twice the depth, in units of colour distance.
     pub depth_weight: f32,
-    /// A mask is dropped if its intersection over union with a mask of a coarser level exceeds this.
+    /// A mask is dropped if its intersection over union with one of a coarser level exceeds this.
     pub max_overlap_iou: f32,
-    /// A mask is dropped if the boundaries predicted along its outline are less than this on average; 0 keeps all.
-    /// What only such masks cover is divided as at the finest level, so that every pixel shows something.
+    /// A mask is dropped if the predicted boundary along its outline is less than this on average; 0 keeps all. What
+    /// only such masks cover is divided as at the finest level, so that every pixel shows something.
     pub min_support: f32,
-    /// Largest number of masks per image; the largest masks are kept.
+    /// Most masks per image; the largest are kept.
     pub max_masks: usize,
 }
 
@@ -84,7 +84,7 @@ impl Default for GraphSettings {
 }
 
 impl GraphSettings {
-    /// Returns the settings for use with the boundary model, with the `n_scales` coarsest scales.
+    /// For use with the boundary model, with the `n_scales` coarsest scales.
     pub fn learnt(n_scales: usize) -> Self {
         Self {
             scales: [1500.0, 800.0, 400.0, 100.0].into_iter().take(n_scales).collect(),
@@ -97,7 +97,6 @@ impl GraphSettings {
     }
 }
 
-/// Finds masks, with or without the embedded boundary model.
 #[derive(Debug)]
 pub struct GraphSegmenter {
     settings: GraphSettings,
@@ -105,11 +104,11 @@ pub struct GraphSegmenter {
     model: Option<ModelPool>,
 }
 
-/// Instances of the model, one per image segmented at a time.
+/// Instances of the model, one per concurrent image.
 #[derive(Debug)]
 struct ModelPool {
     options: SessionOptions,
-    /// The GPUs that instances are opened on, in turn.
+    /// Instances are opened on these in turn.
     gpus: Vec<u32>,
     n_opened: AtomicUsize,
     idle: Mutex<Vec<Boundaries>>,
@@ -133,7 +132,7 @@ impl ModelPool {
 }
 
 impl GraphSegmenter {
-    /// Creates a segmenter without the model; only the first 255 scales count.
+    /// Without the model; only the first 255 scales count.
     pub fn new(mut settings: GraphSettings) -> Self {
         settings.scales.truncate(usize::from(Mask::FILLER));
         settings.max_side_px = settings.max_side_px.max(1);
@@ -141,8 +140,7 @@ impl GraphSegmenter {
         Self { settings, identity, model: None }
     }
 
-    /// Creates a segmenter with the embedded model, which runs on one thread per image; `gpus`: those that share
-    /// the photos, where the session asks for GPUs.
+    /// With the embedded model, on one thread per image; `gpus` share the photos if the session asks for GPUs.
     pub fn learnt(
         settings: GraphSettings,
         session: &SessionOptions,
@@ -194,7 +192,7 @@ impl Segmenter for GraphSegmenter {
 
         let mut masks = Vec::new();
         let finest = self.settings.scales.len().checked_sub(1).map(|finest| &levels[finest]);
-        // The finest component of each pixel that no mask covers.
+        // The finest component of each pixel without a mask.
         let mut rest = finest.map_or(Vec::new(), |finest| finest.of_pixel.clone());
         for (level, labels) in levels.iter().enumerate() {
             let kept = self.kept(&image, &levels[..level], labels);
@@ -220,7 +218,6 @@ impl Segmenter for GraphSegmenter {
     }
 }
 
-/// What the components of one image are judged by.
 struct Segmented<'a> {
     raster: &'a Raster,
     boundaries: Option<&'a [f32]>,
@@ -228,8 +225,8 @@ struct Segmented<'a> {
 }
 
 impl GraphSegmenter {
-    /// Returns the components that are masks, each with its label: large enough, in no coarser level, and outlined
-    /// by boundaries. What is compact needs fewer of these; of the components finer than all levels nothing else counts.
+    /// Components that become masks, with their labels: large enough, in no coarser level, and outlined by boundaries.
+    /// Compact ones need fewer of these; of the scale finer than all levels, only compact ones count.
     fn kept(&self, image: &Segmented<'_>, coarser: &[Labels], labels: &Labels) -> Vec<(u32, Mask)> {
         let &Segmented { raster, boundaries, min_area_px } = image;
         let n_components = labels.area_px.len();
@@ -268,25 +265,25 @@ impl GraphSegmenter {
     }
 }
 
-// Pixels that no component has are in no region.
+// Pixels without a component are in no region.
 const _: () = assert!(NOT_NUMBERED == NO_REGION);
 
-/// An edge of the grid: its pixel times 4, plus the index of the neighbour.
+/// Pixel times 4, plus the index of the neighbour.
 type Edge = u32;
 
 struct Raster {
     width_px: u32,
     height_px: u32,
-    /// Smoothed colour, L* a* b*.
+    /// Smoothed, L* a* b*.
     lab: Vec<[f32; 3]>,
-    /// Metres along the camera's axis, 0 if unknown; none without depth.
+    /// Metres along the camera's axis, 0 if unknown.
     depth_m: Option<Vec<f32>>,
     /// Pixels inside the lens image.
     valid: Vec<bool>,
 }
 
 impl Raster {
-    /// Scales the photo to the working size and prepares its colours and depths. Returns the scaled photo too.
+    /// Scales the photo to the working size and prepares colours and depths; also returns the scaled photo.
     fn new<'a>(input: &SegmentInput<'a>, settings: &GraphSettings) -> (Cow<'a, RgbImage>, Self) {
         let (full_width, full_height) = input.image.dimensions();
         let longest = full_width.max(full_height);
@@ -314,24 +311,22 @@ impl Raster {
         (image, Self { width_px, height_px, lab, depth_m, valid })
     }
 
-    /// Returns the pixel at the other end of an edge; `None` outside the image.
+    /// Pixel at the other end of an edge; `None` outside the image.
     fn neighbour(&self, pixel: usize, step: (i64, i64)) -> Option<usize> {
         let width = self.width_px as usize;
         self.neighbour_of((pixel % width, pixel / width), step)
     }
 
-    /// Returns the pixel beside the one at (x, y); `None` outside the image.
+    /// Pixel beside (x, y); `None` outside the image.
     fn neighbour_of(&self, (x, y): (usize, usize), (dx, dy): (i64, i64)) -> Option<usize> {
         let (width, height) = (i64::from(self.width_px), i64::from(self.height_px));
         let (x, y) = (x as i64 + dx, y as i64 + dy);
         ((0..width).contains(&x) && (0..height).contains(&y)).then_some((y * width + x) as usize)
     }
 
-    /// Returns the relative depth jump between neighbours; 0 if unknown.
-    ///
-    /// The inverse depth of a plane is linear in the image. So the slope on each side is extrapolated across the
-    /// edge, and the jump is the smaller of the two residuals. A slanted floor and the fold between floor and wall
-    /// have no jump.
+    /// Relative depth jump between neighbours; 0 if unknown. A plane's inverse depth is linear in the image, so the
+    /// slope on each side is extrapolated across the edge, and the jump is the smaller of the two residuals. A slanted
+    /// floor and the fold between floor and wall have no jump.
     fn depth_jump(&self, a: usize, b: usize, step: (i64, i64)) -> f32 {
         let Some(depth_m) = &self.depth_m else { return 0.0 };
         let inverse = |pixel: usize| if depth_m[pixel] > 0.0 { 1.0 / depth_m[pixel] } else { f32::NAN };
@@ -347,10 +342,7 @@ impl Raster {
         if relative.is_finite() { relative } else { 0.0 }
     }
 
-    /// Returns the edges between valid pixels with their weights, in ascending order of weight and then of
-    /// position.
-    ///
-    /// `boundaries`: `[neighbour][pixel]`, 0 to 1.
+    /// Edges between valid pixels, ascending by weight, then by position. `boundaries`: `[neighbour][pixel]`, 0 to 1.
     fn edges_by_weight(&self, settings: &GraphSettings, boundaries: Option<&[f32]>) -> Vec<(Edge, u16)> {
         let mut edges = Vec::with_capacity(4 * self.lab.len());
         let (width, height) = (self.width_px as usize, self.height_px as usize);
@@ -362,7 +354,7 @@ impl Raster {
                     continue;
                 }
                 let colour = settings.colour_weight * distance(self.lab[pixel], self.lab[other]);
-                // A jump of relative inverse depth 1/2 is one to twice the depth.
+                // A jump of 1/2 in relative inverse depth is to twice the depth.
                 let jump = if has_depth { self.depth_jump(pixel, other, step) } else { 0.0 };
                 let depth = 2.0 * settings.depth_weight * jump;
                 let boundary = boundaries.map_or(0.0, |of| of[direction * self.lab.len() + pixel]);
@@ -386,7 +378,7 @@ impl Raster {
         sorted
     }
 
-    /// Returns whether a mask has the shape of a thing rather than of what remains between things.
+    /// Whether a mask has the shape of a thing rather than of the space between things.
     fn is_compact(&self, mask: &Mask) -> bool {
         let BoxPx { x0, y0, x1, y1 } = mask.box_px;
         let (area, n_box) = (mask.area_px as f32, (x1 - x0) as f32 * (y1 - y0) as f32);
@@ -394,9 +386,8 @@ impl Raster {
         is_inside && area >= MIN_FILL * n_box && area <= MAX_COMPACT_SHARE * self.lab.len() as f32
     }
 
-    /// Joins pixels over ascending edges while the edge is no larger than both components' largest
-    /// inner weight plus `scale` over their size; then joins what is smaller than `min_area_px` to
-    /// its most similar neighbour.
+    /// Joins pixels over ascending edges while the edge is no larger than both components' largest inner weight plus
+    /// `scale` over their size; then joins what is smaller than `min_area_px` to its most similar neighbour.
     fn components(&self, edges: &[(Edge, u16)], scale: f32, min_area_px: u32) -> Labels {
         let mut components = Components::new(self.lab.len(), scale);
         // Inside the image, because edges exist only there.
@@ -428,10 +419,8 @@ impl Raster {
         Labels { of_pixel: of_item, area_px: sizes }
     }
 
-    /// Returns for each root whether a sufficient share of its component is surrounded by the component.
-    ///
-    /// A smoothed outline is a ramp of colours. A component as narrow as this ramp is a strip of it and belongs to
-    /// no object.
+    /// Whether a sufficient share of each root's component is surrounded by it. A smoothed outline is a ramp of
+    /// colours; a component as narrow as this ramp is a strip of it and belongs to no object.
     fn thick(&self, components: &mut Components) -> Vec<bool> {
         let roots: Vec<usize> =
             (0..self.lab.len() as u32).map(|pixel| components.root(pixel) as usize).collect();
@@ -451,19 +440,18 @@ impl Raster {
     }
 }
 
-/// The partition of one level.
 struct Labels {
     of_pixel: Vec<u32>,
     area_px: Vec<u32>,
 }
 
 impl Labels {
-    /// Returns for each component whether its overlap with a component of a coarser level exceeds `max_iou`.
+    /// Whether each component's overlap with one of a coarser level exceeds `max_iou`.
     fn repeats_of(&self, coarser: &[Self], max_iou: f32) -> Vec<bool> {
         let mut repeats = vec![false; self.area_px.len()];
         for other in coarser {
             let mut unsorted_overlaps: HashMap<(u32, u32), u32> = HashMap::new();
-            // Neighbours are mostly of the same two components.
+            // Neighbouring pixels mostly have the same two components.
             let pairs: Vec<(u32, u32)> =
                 iter::zip(&self.of_pixel, &other.of_pixel).map(|(a, b)| (*a, *b)).collect();
             for same in pairs.chunk_by(|a, b| a == b).filter(|same| same[0].0 != NO_REGION) {
@@ -478,7 +466,7 @@ impl Labels {
     }
 }
 
-/// Samples, for each pixel of the working image, the nearest pixel of an image with this width.
+/// Takes, for each pixel of the working image, the nearest pixel of an image of this width.
 fn sample<T>(width_px: u32, columns: &[u32], rows: &[u32], value_at: impl Fn(usize) -> T) -> Vec<T> {
     let mut values = Vec::with_capacity(columns.len() * rows.len());
     for y in rows {
@@ -488,7 +476,7 @@ fn sample<T>(width_px: u32, columns: &[u32], rows: &[u32], value_at: impl Fn(usi
     values
 }
 
-/// Scales a mask up; `None` if the result is empty.
+/// `None` if the result is empty.
 fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
     let range = |axis: &[u32], low: u32, high: u32| {
         (axis.partition_point(|p| *p < low) as u32, axis.partition_point(|p| *p < high) as u32)
@@ -509,7 +497,7 @@ fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
 mod tests {
     use super::*;
 
-    /// By hand, in 100 x 100 pixels: what fills its box, touches no edge and is no large part of the photo.
+    /// By hand, in 100 x 100 pixels: fills its box, touches no edge and is no large part of the photo.
     #[test]
     fn compact_is_what_has_the_shape_of_a_thing() {
         let (lab, valid) = (vec![[0.0; 3]; 10_000], vec![true; 10_000]);

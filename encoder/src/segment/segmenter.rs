@@ -14,64 +14,61 @@ use crate::lanes::GpuLoad;
 use crate::masks::Mask;
 use crate::masks::rle::RleError;
 
-/// Limit on the masks of one view: the total area of their boxes, one byte per pixel.
+/// Limit on a view's masks: the total area of their boxes, one byte per pixel.
 pub(super) const MAX_MASK_BYTES: u64 = 1 << 30;
 
 pub trait Segmenter: Sync {
-    /// Returns the identity of the segmenter: its method, every parameter, and the hashes of its weights. Two
-    /// segmenters of equal identity find the same masks in a photo for which [`Self::identity_of_view`] is equal
-    /// too.
+    /// Method, every parameter, and hashes of the weights. Segmenters of equal identity find the same masks in a photo
+    /// if [`Self::identity_of_view`] is equal, too.
     fn identity(&self) -> String;
 
-    /// Returns the hash of what this view's masks come from beside the photo: its mask file; `None` if nothing.
+    /// Hash of what the view's masks come from beside the photo: its mask file; `None` if nothing.
     fn identity_of_view(&self, _view: &View) -> Result<Option<Hash32>, SegmentError> {
         Ok(None)
     }
 
-    /// Checks that the views have masks, where these exist already; returns a sentence on those without.
+    /// Checks that views have masks, for masks that exist already; returns a sentence on those without.
     fn check_views(&self, _views: &[View], _strict: bool) -> Result<Option<String>, SegmentError> {
         Ok(None)
     }
 
-    /// Returns whether the segmenter uses [`SegmentInput::depth`], which costs a drawing of the scene.
+    /// Whether it uses [`SegmentInput::depth`], which costs a drawing of the scene.
     fn wants_depth(&self) -> bool {
         false
     }
 
-    /// Returns the number of photos that the segmenter's own threads or device process at once; `None` if it works
-    /// on the caller's thread.
+    /// Photos that its own threads or device process at once; `None` if it works on the caller's thread.
     fn concurrency(&self) -> Option<usize> {
         None
     }
 
-    /// Returns the load of each GPU that runs its models; none on the processor.
+    /// Load of each GPU that runs its models; none on the processor.
     fn loads(&self) -> Vec<GpuLoad> {
         Vec::new()
     }
 
-    /// Returns the masks of a photo; they may overlap.
+    /// Masks may overlap.
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError>;
 }
 
-/// Input of a segmenter: a photo and its context.
 #[derive(Clone, Copy, Debug)]
 pub struct SegmentInput<'a> {
-    /// The view, with the intrinsics of `image` (an ideal pinhole).
+    /// With the intrinsics of `image` (an ideal pinhole).
     pub view: &'a View,
     pub image: &'a RgbImage,
     /// Pixels inside the lens image, row-major; `None` if all are.
     pub valid: Option<&'a [bool]>,
-    /// The mapping that undistorted the photo, to apply to existing masks.
+    /// Mapping that undistorted the photo, to apply to existing masks.
     pub undistorter: Option<&'a Undistorter>,
     /// Depth of the scene, camera z per pixel of `image`, row-major; 0 or NaN if unknown.
     pub depth: Option<&'a [f32]>,
-    /// The threads for [`Self::install`]. A segmenter with threads of its own is not called from one of them: it
-    /// would wait for itself.
+    /// Threads for [`Self::install`]. A segmenter with its own threads must not be called from one of these: it would
+    /// wait for itself.
     pub pool: Option<&'a ThreadPool>,
 }
 
 impl<'a> SegmentInput<'a> {
-    /// Creates the input for a loaded photo, without a pool.
+    /// Without a pool.
     pub fn new(loaded: &'a LoadedImage, depth: Option<&'a [f32]>) -> Self {
         Self {
             view: &loaded.view,
@@ -83,7 +80,7 @@ impl<'a> SegmentInput<'a> {
         }
     }
 
-    /// Runs work on the pool's threads, to which its parallel iterators keep; without a pool, where it is called.
+    /// Runs work, with its parallel iterators, on the pool's threads; without a pool, on the caller's.
     pub(super) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         match self.pool {
             Some(pool) => pool.install(work),

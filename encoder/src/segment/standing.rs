@@ -12,14 +12,14 @@ use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
 /// Smallest mask, pixels: a traffic cone from 40 m.
 const MIN_AREA_PX: u32 = 24;
-/// Largest share of a photo: what is nearer shows its parts better.
+/// Largest share of a photo: nearer things show their parts better.
 const MAX_AREA: f64 = 0.1;
-/// A mask that is nearly another's is left out.
+/// A mask this similar to another one is left out.
 const SAME_IOU: f64 = 0.8;
 
 const _: () = assert!(NO_THING == NO_REGION);
 
-/// A segmenter whose masks are joined by those of what stands on the ground.
+/// A segmenter whose masks are joined by those of standing things.
 pub(crate) struct WithStanding<S> {
     pub(crate) other: S,
     pub(crate) standing: Arc<Standing>,
@@ -48,7 +48,7 @@ impl<S: Segmenter> Segmenter for WithStanding<S> {
         let outlined = masks.iter().filter(|mask| mask.level != Mask::FILLER);
         let outlined: Vec<&Mask> = outlined.collect();
         standing.retain(|mask| outlined.iter().all(|other| iou(mask, other) < SAME_IOU));
-        // A filler is for pixels that nothing else has.
+        // A filler is for pixels without any other mask.
         for filler in masks.iter_mut().filter(|mask| mask.level == Mask::FILLER) {
             standing.iter().for_each(|mask| take_out(filler, mask));
         }
@@ -58,7 +58,7 @@ impl<S: Segmenter> Segmenter for WithStanding<S> {
     }
 }
 
-/// Returns the masks of what stands on the ground: the pixels whose depth leads there.
+/// Masks of standing things: the pixels whose depth leads to them.
 fn masks_of(standing: &Standing, input: &SegmentInput<'_>) -> Vec<Mask> {
     let Some(depth) = input.depth.filter(|_| !standing.is_empty()) else { return Vec::new() };
     let camera = &input.view.intrinsics;
@@ -80,7 +80,6 @@ fn masks_of(standing: &Standing, input: &SegmentInput<'_>) -> Vec<Mask> {
     masks.filter(|mask| (MIN_AREA_PX..=max_area_px).contains(&mask.area_px)).collect()
 }
 
-/// Returns the columns and rows that two boxes share.
 fn common(a: &BoxPx, b: &BoxPx) -> [Range<u32>; 2] {
     [a.x0.max(b.x0)..a.x1.min(b.x1), a.y0.max(b.y0)..a.y1.min(b.y1)]
 }
@@ -92,7 +91,7 @@ fn iou(a: &Mask, b: &Mask) -> f64 {
     both as f64 / (f64::from(a.area_px) + f64::from(b.area_px) - both as f64)
 }
 
-/// Takes another mask's pixels out of a mask; its box stays.
+/// Takes another mask's pixels out; the box stays.
 fn take_out(mask: &mut Mask, other: &Mask) {
     let [columns, rows] = common(&mask.box_px, &other.box_px);
     for y in rows {
@@ -112,7 +111,7 @@ mod tests {
     use super::*;
     use crate::raster::pinhole;
 
-    /// A park of 60 x 60 m and two cars of 4 x 2 x 1 m, 2 m apart, all of one colour; a Gaussian every 10 cm.
+    /// A park of 60 x 60 m and two cars of 4 x 2 x 1 m, 2 m apart, in one colour; a Gaussian every 10 cm.
     fn park() -> Gaussians {
         let ground =
             (0..360_000).map(|i| (f64::from(i % 600) * 0.1 - 30.0, f64::from(i / 600) * 0.1 - 30.0, 0.0));
@@ -124,7 +123,7 @@ mod tests {
         scene
     }
 
-    /// A camera at a height of 21 m that looks down, of which a pixel is 5 cm of a roof.
+    /// A camera 21 m high that looks down, where a pixel is 5 cm of a roof.
     fn from_above() -> View {
         let down = DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z);
         View {
@@ -148,7 +147,7 @@ mod tests {
         }
     }
 
-    /// By hand: the roofs fill 80 x 40 pixels each, whichever way the world is turned; the filler keeps the rest.
+    /// By hand: the roofs fill 80 x 40 pixels each, however the world is turned; the filler keeps the rest.
     #[test]
     fn cars_stand_on_their_park() {
         for turn in [DMat3::IDENTITY, DMat3::from_rotation_x(2.0) * DMat3::from_rotation_y(0.5)] {
@@ -183,7 +182,7 @@ mod tests {
         }
     }
 
-    /// Masks of the other segmenter stay, and what they show already is not added.
+    /// The other segmenter's masks stay, and what they show is not added again.
     #[test]
     fn what_is_outlined_already_is_not_added() {
         let mask = |x1: u32| Mask::whole(BoxPx { x0: 0, y0: 0, x1, y1: 10 });

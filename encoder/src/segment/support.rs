@@ -1,15 +1,13 @@
 //! How much of a component's outline the boundary model confirms.
 //!
-//! Components also end where the graph had to stop somewhere: across a carpet, or around two things with nothing
-//! between them that looks like a border. Such a mask shows no single thing.
+//! Components also end where the graph had to stop: across a carpet, or around two things without a visible border.
+//! Such a mask shows no single thing.
 
 use crate::masks::NO_REGION;
 
-/// Returns for each component the mean, over the pairs of pixels across its outline, of the strongest boundary
-/// predicted within a pixel: 0 to 1, and 1 for a component without an outline. The photo's edge is no outline.
-///
-/// `of_pixel`: each pixel's component, row-major. `boundaries`: `[neighbour][pixel]`, the first to the right, the
-/// third below.
+/// For each component, the mean, over the pairs of pixels across its outline, of the strongest boundary predicted
+/// within a pixel: 0 to 1, and 1 without an outline. The photo's edge is no outline. `of_pixel`: each pixel's
+/// component, row-major. `boundaries`: `[neighbour][pixel]`, the first to the right, the third below.
 pub(super) fn of_outlines(
     of_pixel: &[u32],
     width_px: usize,
@@ -53,13 +51,13 @@ mod tests {
 
     const SIDE: usize = 8;
 
-    /// Component 1 is the square of 4 x 4 px whose upper left pixel is at (x, y), component 0 the rest.
+    /// Component 1 is a square of 4 x 4 px with its upper left pixel at (x, y), component 0 the rest.
     fn square(x: usize, y: usize) -> Vec<u32> {
         let inside = |i: usize| (x..x + 4).contains(&(i % SIDE)) && (y..y + 4).contains(&(i / SIDE));
         (0..SIDE * SIDE).map(|i| u32::from(inside(i))).collect()
     }
 
-    /// Boundaries between pixels of different components, where `seen` says so.
+    /// Boundaries between different components, where `seen` says so.
     fn boundaries(of_pixel: &[u32], seen: impl Fn(usize, usize) -> bool) -> Vec<f32> {
         let mut boundaries = vec![0.0; 4 * SIDE * SIDE];
         for i in 0..SIDE * SIDE {
@@ -81,8 +79,8 @@ mod tests {
         let of_pixel = square(2, 2);
         assert_eq!(support(&of_pixel, &boundaries(&of_pixel, |_, _| true)), [1.0, 1.0]);
         assert_eq!(support(&of_pixel, &boundaries(&of_pixel, |_, _| false)), [0.0, 0.0]);
-        // Without its right side, whose pairs begin in column 5; none of these is beside a pair of another side of
-        // its kind.
+        // Without its right side, whose pairs begin in column 5; none of these is beside a pair of another side of its
+        // kind.
         let three_sides = support(&of_pixel, &boundaries(&of_pixel, |x, y| x != 5 || !(2..6).contains(&y)));
         // The bottom's last pair begins in that column, too, but its neighbour is predicted.
         assert_eq!(three_sides, [0.75, 0.75]);

@@ -52,7 +52,7 @@ pub struct ShardSettings {
 }
 
 impl ShardSettings {
-    /// Returns whether some shards tell how their Gaussians and objects look.
+    /// Whether some shards have the appearance of Gaussians and objects.
     pub fn have_appearance(&self) -> bool {
         self.compact_appearance || self.profiles.iter().any(|profile| *profile != Profile::Compact)
     }
@@ -60,19 +60,17 @@ impl ShardSettings {
 
 pub struct CellEmbeddings {
     pub dim: usize,
-    /// `[N][dim]`: unit, or zeros where there is no evidence.
+    /// `[N][dim]`: unit, or zeros without evidence.
     pub vectors: Vec<f32>,
     pub has_evidence: Vec<bool>,
 }
 
-/// Returns the bytes that building the shards of a cell of `n_gaussians` takes: embeddings in f32, in f16 and in
-/// the shard, and the codebook.
+/// Bytes to build the shards of a cell: embeddings in f32, in f16 and in the shard, and the codebook.
 pub(crate) fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     let per_component = size_of::<f32>() + 2 * size_of::<f16>();
     (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
 }
 
-/// Returns the bytes that building the shards of a scene's largest cell takes.
 pub(crate) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
     let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max();
     largest.map_or(0, |n_gaussians| working_bytes(n_gaussians, dim))
@@ -82,14 +80,14 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
 
-/// What a cell's shards carry besides Gaussians and their embeddings.
+/// What a cell's shards carry beside Gaussians and embeddings.
 #[derive(Clone, Copy, Default)]
 pub struct CellExtras<'a> {
     pub objects: Option<&'a SceneObjects>,
-    /// The free and occupied places of the cell, if they were asked for.
+    /// Free and occupied places, if asked for.
     pub occupancy: Option<Occupancy<'a>>,
     pub photo_poses: Option<PhotoPoses<'a>>,
-    /// What robots recognise the cell by, if that was asked for.
+    /// By which robots recognise the cell, if asked for.
     pub landmarks: Option<Landmarks<'a>>,
 }
 
@@ -101,9 +99,9 @@ pub struct ShardBuilder<'a> {
     pub settings: &'a ShardSettings,
 }
 
-/// The Gaussians of a cell in the order of its shards: by centroid, then along the Morton curve; those without
-/// evidence last. Three numbers name a Gaussian: its place in this order, its *local* (its place in
-/// [`Cell::gaussians`] and in [`CellEmbeddings`]) and its index in the input.
+/// A cell's Gaussians in the order of its shards: by centroid, then along the Morton curve; those without evidence
+/// last. Three numbers name a Gaussian: its place in this order, its *local* (its place in [`Cell::gaussians`] and in
+/// [`CellEmbeddings`]) and its index in the input.
 struct ShardOrder<'a> {
     cell: &'a Cell,
     /// By place: the local.
@@ -116,7 +114,7 @@ impl ShardOrder<'_> {
         self.locals.iter().map(|local| self.cell.gaussians[*local as usize]).collect()
     }
 
-    /// Returns the embeddings in f16, `[n_with_evidence][dim]`.
+    /// Embeddings in f16, `[n_with_evidence][dim]`.
     fn halves(&self, embeddings: &CellEmbeddings) -> Vec<f16> {
         let dim = embeddings.dim;
         let mut halves = vec![f16::ZERO; self.n_with_evidence * dim];
@@ -227,7 +225,7 @@ impl ShardBuilder<'_> {
     }
 }
 
-/// Returns the balanced shard of a compact one, which is the same where no residual code is needed.
+/// Balanced shard of a compact one; the same if no residual code is needed.
 fn with_residuals<'a>(compact: &ShardView<'a>, residuals: Option<&'a CodebookResiduals>) -> ShardView<'a> {
     let Some(residuals) = residuals else { return *compact };
     ShardView {
@@ -263,8 +261,8 @@ fn built(profile: Profile, view: &ShardView<'_>, additions: Additions<'_>) -> Bu
 /// Largest distance between an embedding and its f16 form: half a step of f16 at 1, and of its denormals.
 const F16_ROUNDING: f32 = 5e-4;
 
-/// Returns the photos of each cell: a photo belongs to the cell that is nearest to its camera, so a robot has the
-/// cameras of the area that it fetched and no photo twice.
+/// Photos of each cell: a photo belongs to the cell nearest to its camera, so a robot has the cameras of the area that
+/// it fetched and no photo twice.
 pub fn photo_poses(split: &CellSplit, views: &[&View]) -> Vec<BuiltPhotoPoses> {
     let mut of_cells = vec![BuiltPhotoPoses::default(); split.cells.len()];
     for view in views {
@@ -275,7 +273,7 @@ pub fn photo_poses(split: &CellSplit, views: &[&View]) -> Vec<BuiltPhotoPoses> {
     of_cells
 }
 
-/// Returns the landmarks of each cell, the one that is nearest to each.
+/// Landmarks of each cell: each belongs to the nearest cell.
 pub fn landmarks(split: &CellSplit, code_version: u32, all: &[Landmark]) -> Vec<BuiltLandmarks> {
     let mut of_cells = vec![Vec::new(); split.cells.len()];
     for landmark in all {
@@ -287,8 +285,7 @@ pub fn landmarks(split: &CellSplit, code_version: u32, all: &[Landmark]) -> Vec<
 }
 
 struct QuantisedPositions {
-    /// Largest distance of a stored position from the mean, per axis: half a step, unless the doubles of readers
-    /// are coarser.
+    /// Largest rounding of a stored position, per axis: half a step, or that of readers' doubles if coarser.
     error: f64,
     columns: Columns,
 }

@@ -4,9 +4,9 @@
 //! |---|---|---|
 //! | `generations` | number, big-endian | [`GenerationRecord`], of every generation ever published |
 //!
-//! `encode` and `push` keep the state of their work in trees of their own. A writer holds the database for as long
-//! as it writes; readers read a copy. It repeats what files say, but for the history, so a damaged one is set
-//! aside and made anew from the files.
+//! `encode` and `push` keep their state in trees of their own. A writer holds the database while it writes; readers
+//! read a copy. Except for the history it repeats what files say, so a damaged one is set aside and rebuilt from the
+//! files.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -48,10 +48,9 @@ impl GenerationRecord {
 }
 
 enum Fault {
-    /// Another process holds it.
+    /// By another process.
     Held,
     Damaged(String),
-    /// The file system's.
     Failed(sled::Error),
 }
 
@@ -60,7 +59,7 @@ impl From<sled::Error> for Fault {
         use std::io::ErrorKind as Kind;
 
         match e {
-            // sled has no error kind of its own for this.
+            // sled has no error kind for this.
             sled::Error::Io(e) if e.to_string().contains("could not acquire lock") => Self::Held,
             sled::Error::Io(ref io) if !matches!(io.kind(), Kind::InvalidData | Kind::UnexpectedEof) => {
                 Self::Failed(e)
@@ -70,7 +69,7 @@ impl From<sled::Error> for Fault {
     }
 }
 
-/// Runs work on a database that may be damaged: sled panics on some damage.
+/// Catches panics of sled, which some damage causes.
 fn guarded<T>(work: impl FnOnce() -> Result<T, Fault>) -> Result<T, Fault> {
     catch_unwind(AssertUnwindSafe(work))
         .unwrap_or_else(|_| Err(Fault::Damaged("the database panicked".into())))
@@ -97,8 +96,8 @@ pub(crate) struct Catalogue {
 }
 
 impl Catalogue {
-    /// Opens the database of a store for writing; a damaged one is renamed to `db.damaged`, and an empty one takes
-    /// its place. Waits up to `patience` for another writer.
+    /// Opens a store's database for writing; a damaged one is renamed to `db.damaged` and replaced by an empty one.
+    /// Waits up to `patience` for another writer.
     pub(crate) fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
         if SystemTime::now() < UNIX_EPOCH {
             // sled panics then.
@@ -126,7 +125,7 @@ impl Catalogue {
         }
     }
 
-    /// Opens the database and reads all of it once, so that damage shows here and not later.
+    /// Reads the whole database once, so that damage shows here and not later.
     fn load(path: &Path, patience: Duration) -> Result<Self, Fault> {
         let config = sled::Config::new().path(path).cache_capacity(CACHE_BYTES);
         let start = Instant::now();
@@ -148,7 +147,7 @@ impl Catalogue {
         }
     }
 
-    /// Returns the database, for the state of jobs and pushes.
+    /// For the state of jobs and pushes.
     pub(crate) fn db(&self) -> &sled::Db {
         &self.db
     }
@@ -157,7 +156,7 @@ impl Catalogue {
         self.generations.iter().values().map(|value| decode(&value?)).collect()
     }
 
-    /// Returns all generations ever published, the oldest first.
+    /// All generations ever published, oldest first.
     pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.history().map_err(|fault| records_error(&self.path, fault))
     }
@@ -167,7 +166,6 @@ impl Catalogue {
         Ok(last.and_then(|(key, _)| Some(u64::from_be_bytes(key.as_ref().try_into().ok()?))))
     }
 
-    /// Makes the catalogue say what a manifest says, unless it does.
     pub(crate) fn record(&self, manifest: &Manifest, manifest_hash: Hash32) -> Result<(), StoreError> {
         let write = || -> Result<(), Fault> {
             let key = manifest.generation.to_be_bytes();
@@ -183,7 +181,7 @@ impl Catalogue {
     }
 }
 
-/// What a catalogue says, read from a copy: neither the store nor its lock is touched, so a writer may be at work.
+/// A catalogue read from a copy: neither the store nor its lock is touched, so a writer may be at work.
 #[derive(Debug)]
 pub(crate) struct CatalogueCopy {
     catalogue: Catalogue,
@@ -191,8 +189,8 @@ pub(crate) struct CatalogueCopy {
 }
 
 impl CatalogueCopy {
-    /// Copies a store's catalogue to a folder under `scratch`, which goes with it. `None` if the store has no
-    /// catalogue, or the copy is damaged: a writer may have changed it meanwhile.
+    /// Copies a store's catalogue to a temporary folder under `scratch`. `None` if the store has no catalogue, or the
+    /// copy is damaged because a writer changed it meanwhile.
     pub(crate) fn of(store: &Path, scratch: &Path) -> Result<Option<Self>, StoreError> {
         let db = store.join("db");
         if !db.is_dir() {
@@ -210,12 +208,12 @@ impl CatalogueCopy {
         Ok(loaded.map(|catalogue| Self { catalogue, _folder: folder }))
     }
 
-    /// Returns the copied database, for the state of jobs.
+    /// The copy, for the state of jobs.
     pub(crate) fn db(&self) -> &sled::Db {
         self.catalogue.db()
     }
 
-    /// Returns all generations ever published, the oldest first.
+    /// All generations ever published, oldest first.
     pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.catalogue.generations()
     }

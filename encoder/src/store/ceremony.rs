@@ -1,8 +1,8 @@
 //! Changes of the keys that a store's root names.
 //!
-//! The next root takes effect once enough keys of the present root and of its own have signed it. Where root's
-//! keys lie elsewhere, it waits as a draft, `keys/N.root.draft.json`: the draft is carried there, signed, carried
-//! back and installed.
+//! The next root takes effect once enough keys of the present root and of its own have signed it. If root's keys are
+//! kept elsewhere, it waits as a draft, `keys/N.root.draft.json`, which is carried there, signed, carried back and
+//! installed.
 
 use std::path::{Path, PathBuf};
 
@@ -20,9 +20,9 @@ pub(crate) use super::roles::root_folder as default_root_folder;
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Change {
-    /// All keys of these roles; of no role, the root is signed anew for its whole time.
+    /// All keys of these roles; without roles, the root is signed anew for its whole time.
     Roles(Vec<String>),
-    /// The key of this id, in all roles.
+    /// This key id, in all roles.
     Key(String),
 }
 
@@ -55,8 +55,8 @@ pub(crate) struct KeysStatus {
 }
 
 impl Metadata {
-    /// Makes new keys, and a root that names them. It is installed at once if root's keys in `root_folder` are
-    /// enough; otherwise it is a draft.
+    /// Makes new keys, and a root that names them: installed at once if root's keys in `root_folder` are enough,
+    /// otherwise a draft.
     pub(crate) fn change_keys(
         &self,
         change: &Change,
@@ -84,7 +84,7 @@ impl Metadata {
         }
     }
 
-    /// Installs a draft that is signed, and signs again what the former keys signed.
+    /// Installs a signed draft, and signs again what the former keys signed.
     ///
     /// # Errors
     /// [`StoreError::RootDraft`] unless it follows the present root; [`StoreError`] otherwise.
@@ -114,7 +114,7 @@ impl Metadata {
         Ok(Changed { root_version, root_sha256: Some(sha256_hex(&next)), draft: None })
     }
 
-    /// Returns the present root with new keys in place of those that are replaced.
+    /// The present root with new keys in place of the replaced ones.
     fn next_root(&self, present: &Root, change: &Change, root_folder: &Path) -> Result<Root, StoreError> {
         let is_replaced = |role: &str, id: &str| match change {
             Change::Roles(roles) => roles.iter().any(|named| named == role),
@@ -149,7 +149,6 @@ impl Metadata {
 }
 
 impl MetadataReader {
-    /// Describes the keys. `root_folder`: where root's keys may lie.
     pub(crate) fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
         let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
         let mut here: Vec<String> =
@@ -174,7 +173,7 @@ impl MetadataReader {
         })
     }
 
-    /// Returns the SHA-256 of the newest root, hex.
+    /// SHA-256 of the newest root, hex.
     pub(crate) fn root_sha256(&self) -> Result<String, StoreError> {
         Ok(sha256_hex(&self.newest_root()?.ok_or_else(|| self.no_root())?.bytes))
     }
@@ -184,7 +183,7 @@ impl MetadataReader {
     }
 }
 
-/// Signs a draft with all keys of a folder, and returns how many these are.
+/// Signs a draft with all keys of a folder; returns their number.
 pub(crate) fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, StoreError> {
     let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
     let bytes = fs_err::read(draft)?;

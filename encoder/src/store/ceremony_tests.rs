@@ -43,7 +43,7 @@ fn robots_follow_every_change_of_keys() {
     follow(&mut sleeper, dir.path(), clock_unix_secs()).expect("follows all roots at once");
 }
 
-/// Two of three root keys must sign; they lie on other machines, one each.
+/// Two of three root keys must sign; each is on another machine.
 #[test]
 fn a_draft_is_carried_to_the_root_keys() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -67,7 +67,7 @@ fn a_draft_is_carried_to_the_root_keys() {
     let changed =
         metadata.change_keys(&Change::Key(stolen.clone()), &nowhere, clock_unix_secs()).expect("drafted");
     let draft = changed.draft.expect("without a key it is a draft");
-    // The store goes on under the present root meanwhile.
+    // Meanwhile, the store goes on under the present root.
     metadata.refresh(clock_unix_secs(), 1).expect("signs");
     follow(&mut kept, &store, clock_unix_secs()).expect("nothing has changed");
     for holder in &holders {
@@ -75,7 +75,7 @@ fn a_draft_is_carried_to_the_root_keys() {
             metadata.install_root(&draft, clock_unix_secs()),
             Err(StoreError::RootDraft { cause: TufError::Signatures { .. }, .. })
         ));
-        // Signed twice, it counts once.
+        // A second signature does not count.
         for _ in 0..2 {
             assert_eq!(sign_draft(&draft, holder).expect("signs"), 1);
         }
@@ -92,7 +92,7 @@ fn a_draft_is_carried_to_the_root_keys() {
     assert!(matches!(metadata.make_root(&usb, 1, 1, 0), Err(StoreError::HasRoot { .. })));
 }
 
-/// A crash between the root and the keys: the key that the root names is put in place when it is needed.
+/// A crash between root and keys: the named key is put in place when needed.
 #[test]
 fn a_key_that_a_crash_left_behind_is_put_in_place() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -110,7 +110,7 @@ fn a_key_that_a_crash_left_behind_is_put_in_place() {
     follow(&mut kept, dir.path(), clock_unix_secs()).expect("fresh");
 }
 
-/// A role's key that is lost or damaged: the error names the command that helps, and robots follow it.
+/// A lost or damaged key of a role: the error names the command that helps, and robots follow it.
 #[test]
 fn a_lost_key_of_a_role_is_rotated() {
     for role in ["targets", "snapshot", "timestamp"] {
@@ -143,7 +143,7 @@ fn a_lost_key_of_a_role_is_rotated() {
     }
 }
 
-/// Only a change of keys needs root's keys: a damaged one stops nothing else, and is named where it is needed.
+/// Only changes of keys need root's keys: a damaged one stops nothing else, and is named when needed.
 #[test]
 fn a_damaged_root_key_stops_changes_of_keys_alone() {
     let dir = tempfile::tempdir().expect("temporary folder");

@@ -72,16 +72,15 @@ impl From<io::Error> for StoreError {
     }
 }
 
-/// What helps where a root is damaged or missing: nothing else may take its place.
+/// Help for a damaged or missing root: nothing else may replace it.
 const ROOT_HELP: &str =
     "copy it from a backup of the store, or from v1/metadata/ of what `slag-encoder store export` wrote";
 
-/// Returns what helps against an error of the file system.
 pub(crate) fn io_help(error: &io::Error) -> &'static str {
     by_the_system(error).unwrap_or("check permissions and free space")
 }
 
-/// Returns what helps against an error of the database: `otherwise`, unless the fault is the disk's.
+/// Help for an error of the database: `otherwise`, unless the disk is at fault.
 pub(crate) fn records_help(error: &sled::Error, otherwise: &'static str) -> &'static str {
     match error {
         sled::Error::Io(error) => by_the_system(error).unwrap_or(otherwise),
@@ -92,7 +91,7 @@ pub(crate) fn records_help(error: &sled::Error, otherwise: &'static str) -> &'st
 fn by_the_system(error: &io::Error) -> Option<&'static str> {
     use io::ErrorKind as Kind;
 
-    // sled wraps some errors, and then only the text tells.
+    // sled wraps some errors, so that only the text tells.
     let is_full = || error.to_string().contains("No space left");
     match error.kind() {
         Kind::StorageFull | Kind::QuotaExceeded => Some(FULL),
@@ -104,7 +103,6 @@ fn by_the_system(error: &io::Error) -> Option<&'static str> {
 
 const FULL: &str = "free space on that disk, then run the same command again: what is done is kept";
 
-/// Says what is wrong with a manifest on this disk.
 pub(super) fn manifest_fault(cause: &ManifestError) -> String {
     match cause {
         ManifestError::Version { .. } => cause.to_string(),
@@ -118,13 +116,13 @@ pub(super) fn manifest_fault(cause: &ManifestError) -> String {
 
 fn manifest_help(cause: &ManifestError) -> &'static str {
     match cause {
-        // The fault says it.
+        // The fault includes the help.
         ManifestError::Version { .. } => "",
         _ => "; run `slag-encoder encode` again, which writes it anew",
     }
 }
 
-/// Says what is wrong with metadata, for those who have the store: other advice than robots get.
+/// Fault of metadata, for the store's owner: other advice than robots get.
 pub(super) fn metadata_fault(cause: &TufError) -> String {
     match cause {
         TufError::Format { what, .. } => format!("it is damaged: {what}"),
@@ -141,7 +139,6 @@ pub(super) fn metadata_fault(cause: &TufError) -> String {
     }
 }
 
-/// Returns what helps where a file of metadata is damaged or missing.
 pub(super) fn metadata_help(path: &Path) -> &'static str {
     let is_root = path.to_str().is_some_and(|path| path.ends_with(".root.json"));
     if is_root { ROOT_HELP } else { "run `slag-encoder store refresh`, which signs it anew" }
@@ -151,7 +148,7 @@ pub(super) fn metadata_help(path: &Path) -> &'static str {
 mod tests {
     use super::*;
 
-    /// A disk that is full, or takes no writes, is no damaged database.
+    /// A full or read-only disk is no damaged database.
     #[test]
     fn advice_fits_the_fault_of_the_disk() {
         let said = |error: io::Error| {

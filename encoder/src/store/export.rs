@@ -28,8 +28,8 @@ pub(crate) struct Exported {
     pub(crate) n_removed: usize,
 }
 
-/// Writes what robots need of a store into a folder, or brings one up to date. Robots that fetch meanwhile find
-/// the old generation or the new one.
+/// Writes what robots need of a store into a folder, or updates one. Robots that fetch meanwhile find the old
+/// generation or the new one.
 ///
 /// # Errors
 /// [`StoreError`]; [`StoreError::ObjectHash`] for a damaged shard, before anything names it;
@@ -58,7 +58,7 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     }
     let generations = || reader.previous().into_iter().chain([reader.current()]);
     let lens: BTreeMap<Hash32, u64> = generations().flat_map(Published::object_lens).collect();
-    // A folder on a stick or a server's disk may have been damaged since.
+    // Files on a stick or a server's disk may have been damaged since.
     let is_there = |hash: &Hash32| {
         files::hash_of(&objects.join(hash.to_string())).is_ok_and(|(found, _)| found == *hash)
     };
@@ -73,7 +73,7 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
             durable::write(&targets.join(name), &published.bytes)?;
         }
     }
-    // The timestamp comes last by its name: roots, targets and snapshots are there before it names them.
+    // By name the timestamp comes last: roots, targets and snapshots are there before it names them.
     for (name, bytes) in &metadata {
         // What robots need was read, or the walk would have refused it.
         if let Ok(bytes) = bytes {

@@ -12,7 +12,6 @@ use super::error::StoreError;
 
 pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
 
-/// Counts and hashes what passes on its way to a file.
 pub(super) struct HashingWriter {
     file: BufWriter<File>,
     hasher: blake3::Hasher,
@@ -31,12 +30,12 @@ impl Write for HashingWriter {
 }
 
 impl HashingWriter {
-    /// Creates a file that must not exist.
+    /// The file must not exist.
     pub(super) fn create(path: &Path) -> io::Result<Self> {
         Ok(Self { file: BufWriter::new(File::create_new(path)?), hasher: blake3::Hasher::new() })
     }
 
-    /// Makes the file durable and returns the hash and length of its content.
+    /// Makes the file durable; returns its hash and length.
     pub(super) fn finish(self) -> io::Result<(Hash32, u64)> {
         let file = self.file.into_inner().map_err(io::IntoInnerError::into_error)?;
         file.sync_all()?;
@@ -44,18 +43,18 @@ impl HashingWriter {
     }
 }
 
-/// Returns the hash and length of a file's content, read piece by piece.
+/// Hash and length of a file, read piece by piece.
 pub(super) fn hash_of(path: &Path) -> io::Result<(Hash32, u64)> {
     Hash32::of_reader(File::open(path)?)
 }
 
-/// Creates a folder durably, unless it is there.
+/// Creates a folder durably, if missing.
 pub(super) fn ensure_folder(path: &Path) -> io::Result<()> {
     ensure_folder_unsynced(path)?;
     path.parent().map_or(Ok(()), sync_folder)
 }
 
-/// Creates a folder, unless it is there; its name is durable once its parent is synced.
+/// Creates a folder, if missing; its name is durable once its parent is synced.
 pub(super) fn ensure_folder_unsynced(path: &Path) -> io::Result<()> {
     match fs_err::create_dir(path) {
         Err(e) if e.kind() == io::ErrorKind::AlreadyExists => Ok(()),
@@ -64,10 +63,10 @@ pub(super) fn ensure_folder_unsynced(path: &Path) -> io::Result<()> {
 }
 
 pub(super) const MANIFEST: &str = "manifest";
-/// The one before it, which fetches in progress may still need.
+/// For fetches that began before the last publication.
 pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
 
-/// Reads a manifest's bytes; `None` if there is no such file.
+/// `None` if there is no such file.
 pub(super) fn read_manifest_bytes(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
     read_limited(path, manifest::MAX_BYTES, |len_bytes| {
         let cause = ManifestError::TooLong { len_bytes };
@@ -75,7 +74,7 @@ pub(super) fn read_manifest_bytes(path: &Path) -> Result<Option<Vec<u8>>, StoreE
     })
 }
 
-/// Reads a file of at most `max_bytes`; `None` if there is no such file.
+/// Reads at most `max_bytes`; `None` if there is no such file.
 pub(super) fn read_limited(
     path: &Path,
     max_bytes: u64,
@@ -107,7 +106,7 @@ impl ModelsRecord {
         dir.join(FILE)
     }
 
-    /// Reads the record. An unreadable one counts as absent: the user can still name the models.
+    /// An unreadable record counts as absent: the user can still name the models.
     pub(super) fn read(dir: &Path) -> io::Result<Option<Self>> {
         match fs_err::read(Self::path(dir)) {
             Ok(bytes) => Ok(serde_json::from_slice(&bytes).ok()),

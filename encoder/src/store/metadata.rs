@@ -27,13 +27,13 @@ use super::error::StoreError;
 use super::{files, reader, roles};
 
 pub(crate) const TIMESTAMP_FILE: &str = "timestamp.json";
-/// Days for which a timestamp counts, unless a refresh says otherwise.
+/// Validity of a timestamp, unless a refresh says otherwise.
 pub(crate) const TIMESTAMP_DAYS: u32 = 30;
 const SECS_PER_DAY: u64 = 86_400;
 const TARGETS_SECS: u64 = 365 * SECS_PER_DAY;
 pub(super) const ROOT_SECS: u64 = 5 * 365 * SECS_PER_DAY;
-/// 2026-01-01: nothing is signed as of an earlier time, whatever a machine's clock says that forgot the time. What
-/// is signed as of 1970 has expired before any robot sees it.
+/// 2026-01-01: nothing is signed as of an earlier time, whatever a machine's clock says. What is signed as of 1970 has
+/// expired before any robot sees it.
 pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 
 /// What a signature of the timestamp states.
@@ -44,14 +44,13 @@ pub(crate) struct Refreshed {
     pub(crate) expires_unix_secs: u64,
 }
 
-/// Metadata and the bytes of its file.
 type WithBytes<T> = (SignedMetadata<T>, Vec<u8>);
 
-/// What clients are led to.
+/// What clients find.
 struct PublishedMetadata {
     targets: Targets,
     snapshot_meta: FileMeta,
-    /// When the first of targets and snapshot expires.
+    /// First expiry of targets and snapshot.
     soonest_unix_secs: u64,
 }
 
@@ -64,7 +63,7 @@ pub(crate) struct MetadataReader {
     pub(super) store: PathBuf,
 }
 
-/// The metadata of a store, held by one writer at a time.
+/// A store's metadata, held by one writer at a time.
 pub(crate) struct Metadata {
     reader: MetadataReader,
     _lock: File,
@@ -79,13 +78,13 @@ impl Deref for Metadata {
 }
 
 impl MetadataReader {
-    /// Reads the metadata of a store, without a lock.
+    /// Takes no lock.
     pub(crate) fn new(store: &Path) -> Self {
         Self { store: store.to_owned() }
     }
 
-    /// Returns what a root leads clients to, whatever its expiry; `None` where a file on the way is missing or
-    /// damaged, or not signed by a key that the root names.
+    /// Follows a root to what clients find, whatever its expiry; `None` if a file on the way is missing or damaged, or
+    /// not signed by a key in the root.
     fn published(&self, root: &Root) -> Result<Option<PublishedMetadata>, StoreError> {
         let timestamp = self.read_signed::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES, root)?;
         let Some((timestamp, _)) = timestamp else { return Ok(None) };
@@ -113,8 +112,7 @@ impl MetadataReader {
         self.published(&root.body)
     }
 
-    /// Returns the targets that a root leads clients to; where it leads nowhere, the manifest of the store. `None`
-    /// where nothing is published.
+    /// Targets that a root leads to, or else the store's manifest; `None` if nothing is published.
     pub(super) fn targets(&self, root: &Root) -> Result<Option<Targets>, StoreError> {
         if let Some(published) = self.published(root)? {
             return Ok(Some(published.targets));
@@ -126,12 +124,12 @@ impl MetadataReader {
         }
     }
 
-    /// Returns whether clients are led to these bytes of a manifest.
+    /// Whether clients are led to these bytes of a manifest.
     pub(super) fn vouches_for(&self, manifest: &[u8]) -> Result<bool, StoreError> {
         Ok(self.published_by_newest()?.is_some_and(|published| published.targets == targets_of(manifest)))
     }
 
-    /// Reads metadata that keys of a root signed; `None` if it is missing, damaged or not signed.
+    /// `None` if it is missing, damaged or not signed by keys of the root.
     fn read_signed<T: Body>(
         &self,
         name: &str,
@@ -148,8 +146,7 @@ impl MetadataReader {
         Ok(is_signed.then_some((found, bytes)))
     }
 
-    /// Reads metadata that keys of any root of this store signed, the newest first: what it states was seen by
-    /// clients.
+    /// Reads metadata signed by any root of this store, newest first: clients have seen what it states.
     fn read_of_any_root<T: Body>(
         &self,
         name: &str,
@@ -170,7 +167,6 @@ impl MetadataReader {
         Ok(None)
     }
 
-    /// Returns whether anything was signed here, by whatever root.
     fn is_begun(&self) -> Result<bool, StoreError> {
         let has = |role: &str| Ok::<_, StoreError>(!self.versions(role)?.is_empty());
         Ok(self.path(TIMESTAMP_FILE).exists() || has(Targets::TYPE)? || has(Snapshot::TYPE)?)
@@ -180,15 +176,15 @@ impl MetadataReader {
         self.read::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)
     }
 
-    /// Returns when the timestamp was signed; `None` if that was not with a key of the newest root, which clients
-    /// forget with its key.
+    /// Time at which the timestamp was signed; `None` if not by a key of the newest root, as clients forget it with its
+    /// key.
     fn signed_unix_secs(&self) -> Result<Option<u64>, StoreError> {
         let Some(RootFile { root, .. }) = self.newest_root()? else { return Ok(None) };
         let timestamp = self.read_signed::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES, &root.body)?;
         Ok(timestamp.and_then(|(timestamp, _)| parse_utc(timestamp.body.signed_at.as_deref()?)))
     }
 
-    /// Returns the newest root and its bytes; `None` before the first one.
+    /// The newest root and its bytes; `None` before the first one.
     pub(super) fn newest_root(&self) -> Result<Option<RootFile>, StoreError> {
         let name = format!("{}.root.json", self.next_version(Root::TYPE)? - 1);
         let Some(bytes) = read_file(&self.store, &name, MAX_ROOT_BYTES)? else { return Ok(None) };
@@ -199,12 +195,11 @@ impl MetadataReader {
         Ok(Some(RootFile { root, bytes }))
     }
 
-    /// Returns the version after the highest one of a role's numbered files.
+    /// One above the highest version of a role's numbered files.
     fn next_version(&self, role: &str) -> Result<u64, StoreError> {
         Ok(self.versions(role)?.into_iter().max().unwrap_or(0).saturating_add(1))
     }
 
-    /// Returns the versions of a role's numbered files, in no order.
     fn versions(&self, role: &str) -> Result<Vec<u64>, StoreError> {
         let suffix = format!(".{role}.json");
         let mut versions = Vec::new();
@@ -224,8 +219,7 @@ impl MetadataReader {
         folder(&self.store).join(name)
     }
 
-    /// Returns what expires soon, or has expired: robots then refuse the store. Each text says until when, and
-    /// what to do.
+    /// What has expired or expires soon, so that robots refuse the store. Each text says until when, and what to do.
     pub(crate) fn expiry_warnings(&self, now_unix_secs: u64) -> Result<Vec<String>, StoreError> {
         let store = self.store.display();
         let expires = |what: &str, at: u64, command: &str| {
@@ -265,7 +259,7 @@ impl MetadataReader {
 }
 
 impl Metadata {
-    /// Opens the metadata for writing. An encode that runs does not hinder it; another signature is waited for.
+    /// Opens the metadata for writing; waits for another signature, but not for an encode.
     pub(crate) fn open(store: &Path) -> Result<Self, StoreError> {
         let folder = folder(store);
         files::ensure_folder(&folder)?;
@@ -276,9 +270,8 @@ impl Metadata {
         Ok(Self { reader: MetadataReader::new(store), _lock: lock })
     }
 
-    /// Publishes a manifest; nothing changes if it is published already. Makes keys and root at the first time.
-    /// `created_unix_secs`: when the manifest was made; the clock counts if it is later, because a manifest may be
-    /// dated back to be reproducible.
+    /// Publishes a manifest, unless it is published already; makes keys and root the first time. `created_unix_secs`:
+    /// of the manifest; a later clock counts instead, because a reproducible manifest may be dated back.
     pub(crate) fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
         let now_unix_secs = created_unix_secs.max(signing_unix_secs());
         if self.newest_root()?.is_none() {
@@ -296,7 +289,7 @@ impl Metadata {
         self.sign_all(&targets, now_unix_secs).map(drop)
     }
 
-    /// Checks that the next publication can be signed: hours of work come before it.
+    /// Checks that the next publication can be signed, before hours of work.
     pub(crate) fn check_keys(&self) -> Result<(), StoreError> {
         match self.newest_root()? {
             Some(_) => roles::ONLINE.into_iter().try_for_each(|role| self.key(role).map(drop)),
@@ -305,8 +298,8 @@ impl Metadata {
         }
     }
 
-    /// Signs the timestamp anew, and the rest before half of its time is over, or where it is damaged or missing.
-    /// Needs the root's key never.
+    /// Signs the timestamp anew; the rest if half of its time is over, or if it is damaged or missing. Never needs
+    /// root's key.
     ///
     /// # Errors
     /// [`StoreError::NotPublished`] before the first publication; [`StoreError`] otherwise.
@@ -328,7 +321,7 @@ impl Metadata {
         self.sign_timestamp(snapshot_meta, now_unix_secs, days, false)
     }
 
-    /// Makes keys and the first root. `root_folder`: where root's keys lie, `n_root_keys` of them.
+    /// Makes keys and the first root, with `n_root_keys` of them in `root_folder`.
     pub(crate) fn make_root(
         &self,
         root_folder: &Path,
@@ -355,8 +348,8 @@ impl Metadata {
         Ok(())
     }
 
-    /// Signs targets, snapshot and timestamp; returns what the timestamp states of the snapshot. No version goes
-    /// back, neither behind the files that are there nor behind what they state of those that are not.
+    /// Signs targets, snapshot and timestamp; returns the timestamp's entry for the snapshot. No version goes back,
+    /// neither behind existing files nor behind what they state of missing ones.
     pub(super) fn sign_all(&self, targets: &Targets, now_unix_secs: u64) -> Result<FileMeta, StoreError> {
         let expires = now_unix_secs.saturating_add(TARGETS_SECS);
         let timestamp = self.read_of_any_root::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)?;
@@ -380,8 +373,8 @@ impl Metadata {
         Ok(meta)
     }
 
-    /// Never signs as of an earlier time than before with the same key: clients that saw the later one take it for
-    /// the time, and refuse what has expired by then. `is_first`: no timestamp was ever signed.
+    /// Never signs as of an earlier time than before with the same key: clients that saw the later one take it for the
+    /// present, and refuse what has expired by then. `is_first`: no timestamp was ever signed.
     fn sign_timestamp(
         &self,
         snapshot: FileMeta,
@@ -393,7 +386,7 @@ impl Metadata {
         let timestamp_version = match before {
             Some(before) => before.head.version.saturating_add(1),
             None if is_first => 1,
-            // The version before is lost, and robots refuse a lower one: no store signs more than once a second.
+            // The previous version is lost, and robots refuse a lower one: no store signs more than once a second.
             None => now.max(signing_unix_secs()),
         };
         let now = now.max(self.signed_unix_secs()?.unwrap_or(0));
@@ -406,7 +399,7 @@ impl Metadata {
         Ok(Refreshed { timestamp_version, snapshot_version, expires_unix_secs })
     }
 
-    /// Returns a role's key, if the newest root names it: a signature by another one would lock clients out.
+    /// A role's key, if the newest root names it: another one's signature would lock clients out.
     fn key(&self, role: &str) -> Result<SigningKey, StoreError> {
         let wrong = || StoreError::RoleKey { role: role.to_owned(), path: folder(&self.store) };
         let root = self.newest_root()?.ok_or_else(wrong)?.root;
@@ -428,8 +421,7 @@ pub(crate) fn clock_unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
-/// Returns the time as of which metadata is signed: the system's, unless its clock stands before this program was
-/// made.
+/// Time of signatures: the system's, but never before this program was made.
 pub(crate) fn signing_unix_secs() -> u64 {
     signing_time(clock_unix_secs())
 }
@@ -438,11 +430,11 @@ pub(super) fn signing_time(clock_unix_secs: u64) -> u64 {
     clock_unix_secs.max(RELEASE_UNIX_SECS)
 }
 
-/// Reads a metadata file of a store by the name that clients ask for; `None` if there is no such file.
+/// Reads a metadata file by the name that clients ask for; `None` if there is no such file.
 pub(crate) fn read_published(store: &Path, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
     let max_bytes = match name.split_once('.') {
         Some(("timestamp", "json")) => MAX_TIMESTAMP_BYTES,
-        // One spelling a number, so that no name leaves the folder.
+        // Numbers have one spelling, so that no name leaves the folder.
         Some((version, role)) if version.parse().is_ok_and(|v: u64| v.to_string() == version) => match role {
             "root.json" => MAX_ROOT_BYTES,
             "snapshot.json" => MAX_SNAPSHOT_BYTES,
@@ -462,7 +454,7 @@ fn read_file(store: &Path, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>
     })
 }
 
-/// Lists the names in the folder of a store's metadata; none if there is no such folder.
+/// File names in a store's metadata folder; none without the folder.
 pub(super) fn names(store: &Path) -> io::Result<Vec<String>> {
     let entries = match fs_err::read_dir(folder(store)) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),

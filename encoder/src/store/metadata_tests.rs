@@ -40,12 +40,11 @@ pub(super) fn client(dir: &Path) -> Kept {
     Kept::from_root(&read_published(dir, "1.root.json").expect("readable").expect("there")).expect("a root")
 }
 
-/// Publishes a generation of an empty scene, of 1970.
+/// A generation of an empty scene, dated 1970.
 pub(super) fn publish_in(dir: &Path, generation: u64) -> Result<(), StoreError> {
     Store::create_or_open(dir)?.publish(&manifest_of(generation, &[]), &Extras::new()).map(drop)
 }
 
-/// Lets a robot see the manifest that is published.
 pub(super) fn follow(kept: &mut Kept, dir: &Path, now: u64) -> Result<Trusted, TufError> {
     let trusted = refresh(kept, &mut Folder(dir), now)?;
     let bytes = fs_err::read(dir.join("manifest")).expect("there");
@@ -63,13 +62,13 @@ fn each_generation_is_a_target() {
         assert_eq!(trusted.timestamp().map(|t| t.head.version), Some(generation));
         assert_eq!(trusted.now_unix_secs(), NOW + generation, "the signed time is later than the clock");
     }
-    // The same again signs nothing.
+    // Publishing the same again signs nothing.
     let before = fs_err::read(dir.path().join("metadata/timestamp.json")).expect("there");
     publish(&store, 4, NOW + 4);
     assert_eq!(fs_err::read(dir.path().join("metadata/timestamp.json")).expect("there"), before);
 }
 
-/// A crash after the manifest was replaced leaves clients with the generation before; opening makes it good.
+/// A crash after replacing the manifest leaves clients with the previous generation; opening repairs it.
 #[test]
 fn metadata_behind_the_manifest_is_made_good() {
     let (dir, store) = published(NOW);
@@ -107,8 +106,8 @@ fn a_refresh_keeps_clients_and_needs_no_root_key() {
     follow(&mut kept, dir.path(), later).expect("fresh");
 }
 
-/// A root that was made while the clock stood at 1970 has expired for every robot: a refresh does not help, a
-/// renewal does, and the warnings say so. Nobody is warned of a root that has years to go.
+/// A root made while the clock stood at 1970 has expired for every robot: a refresh does not help, a renewal does, and
+/// the warnings say so. A root with years to go causes no warning.
 #[test]
 fn an_expired_root_is_warned_of_and_renewed() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -144,8 +143,8 @@ fn an_expired_root_is_warned_of_and_renewed() {
     assert!(warnings.len() == 1 && warnings[0].contains("set the clock"), "{warnings:?}");
 }
 
-/// A store was made while its clock stood in 2079. Robots that saw it believe that time: what is signed afterwards is
-/// signed as of it, until a new key of the timestamp makes them forget it; warnings say so.
+/// A store made while its clock stood in 2079: robots that saw it believe that time, so later signatures use it, until
+/// a new timestamp key makes robots forget it; warnings say so.
 #[test]
 fn a_clock_that_went_back_locks_no_robot_out() {
     let (dir, _store) = published(NOW);
@@ -164,14 +163,14 @@ fn a_clock_that_went_back_locks_no_robot_out() {
     assert_eq!(MetadataReader::new(dir.path()).expiry_warnings(now).expect("reads"), [""; 0]);
 }
 
-/// What is signed by a machine whose clock stands at 1970 has not expired before robots see it.
+/// A machine whose clock stands at 1970 signs nothing that has expired already.
 #[test]
 fn nothing_is_signed_as_of_1970() {
     assert_eq!(RELEASE_UNIX_SECS, 20_454 * DAY, "2026-01-01");
     assert_eq!([signing_time(5), signing_time(NOW)], [RELEASE_UNIX_SECS, NOW]);
 }
 
-/// A key that the root does not name would lock every client out.
+/// Its signature would lock every client out.
 #[test]
 fn a_key_that_the_root_does_not_name_signs_nothing() {
     let (dir, _store) = published(NOW);
@@ -204,7 +203,7 @@ fn only_names_of_metadata_are_read() {
     }
 }
 
-/// A reproducible encode dates its manifest back; its timestamp must count nevertheless.
+/// A reproducible encode dates its manifest back; the timestamp must still be valid.
 #[test]
 fn a_manifest_that_is_dated_back_is_signed_today() {
     let (dir, _store) = published(1);

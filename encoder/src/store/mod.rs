@@ -13,13 +13,12 @@
 //! | `job/` | working files of an unfinished encode |
 //! | `tmp/` | files being written |
 //!
-//! **Crash safety.** [`Store::publish`] goes in an order where each step leaves a whole store: objects are durable
-//! before (they are synced and renamed one by one, and checked here), then `extras/NEW`, then `manifest.previous`
-//! becomes the current one, then `manifest` is replaced. That last rename is the commit for readers of this
-//! machine: since extras are named by the hash of the manifest they belong to, it switches both at once. Clients
-//! of the metadata follow `metadata/timestamp.json`, which comes after it. The catalogue in sled repeats the
-//! manifests, and knows the generations before them. What a crash left out of metadata and records is made good at
-//! the next [`Store::create_or_open`].
+//! **Crash safety.** [`Store::publish`] leaves a whole store after each step: first durable objects (synced and renamed
+//! one by one, and checked here), then `extras/NEW`, then `manifest.previous` becomes the current one, then `manifest`
+//! is replaced. That rename is the commit for readers on this machine; it switches extras as well, which are named by
+//! their manifest's hash. Clients of the metadata follow `metadata/timestamp.json`, which comes after it. The catalogue
+//! in sled repeats the manifests, and knows the generations before them. The next [`Store::create_or_open`] completes
+//! metadata and records after a crash.
 
 mod catalogue;
 pub(crate) mod ceremony;

@@ -21,11 +21,11 @@ pub type Extras = BTreeMap<String, Hash32>;
 #[derive(Clone, Debug)]
 pub struct Published {
     pub manifest: Manifest,
-    /// Its bytes, as robots get them.
+    /// As robots get them.
     pub bytes: Vec<u8>,
     /// BLAKE3 of the bytes.
     pub hash: Hash32,
-    /// Objects beside the shards.
+    /// Beside the shards.
     pub extras: Extras,
 }
 
@@ -45,20 +45,20 @@ impl Published {
         shards.map(|shard| (shard.hash, shard.len_bytes)).collect()
     }
 
-    /// Returns the lengths of all that robots may fetch, by hash: the shards and, if there is one, the text model.
+    /// Lengths of all that robots may fetch, by hash: the shards and, if there is one, the text model.
     pub(crate) fn object_lens(&self) -> BTreeMap<Hash32, u64> {
         let text_model = self.manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
         let text_model = text_model.map(|object| (object.hash, object.len_bytes));
         self.shard_lens().into_iter().chain(text_model).collect()
     }
 
-    /// Returns the hashes of all that robots may fetch, and of extras.
+    /// Hashes of all that robots may fetch, and of extras.
     pub(super) fn all_objects(&self) -> BTreeSet<Hash32> {
         self.object_lens().into_keys().chain(self.extras.values().copied()).collect()
     }
 }
 
-/// The version of a file, read without its content.
+/// A file's version, read without its content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Stamp {
     modified: Option<SystemTime>,
@@ -67,7 +67,7 @@ pub(crate) struct Stamp {
 }
 
 impl Stamp {
-    /// Returns the version of a store's manifest; `None` if there is none or its metadata cannot be read.
+    /// `None` if there is no manifest or its file metadata cannot be read.
     pub(crate) fn of_manifest(dir: &Path) -> Option<Self> {
         Self::of(&dir.join(files::MANIFEST)).ok()
     }
@@ -79,7 +79,7 @@ impl Stamp {
     }
 }
 
-/// A snapshot of what a store publishes; stays readable while a writer publishes the next generation.
+/// Snapshot of a published store; stays readable while a writer publishes the next generation.
 #[derive(Clone, Debug)]
 pub struct StoreReader {
     dir: PathBuf,
@@ -96,7 +96,7 @@ impl StoreReader {
     /// gone since, [`StoreError`] otherwise.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         let path = dir.join(files::MANIFEST);
-        // Before the content: a manifest that is replaced in between is then noticed, not missed.
+        // Before the content, so that a replacement in between is noticed.
         let stamp = Stamp::of(&path).map_err(|e| match e.kind() {
             io::ErrorKind::NotFound if was_published(dir) => StoreError::ManifestLost { path },
             io::ErrorKind::NotFound => StoreError::NotPublished { path },
@@ -115,17 +115,16 @@ impl StoreReader {
         Ok(Self { dir: dir.to_owned(), current, previous, stamp })
     }
 
-    /// Returns the version of the manifest that this reader read.
     pub(crate) fn stamp(&self) -> Stamp {
         self.stamp
     }
 
-    /// Returns whether the store still has the manifest that this reader read (one `stat`).
+    /// Whether the store still has this reader's manifest (one `stat`).
     pub(crate) fn is_current(&self) -> bool {
         Stamp::of(&self.dir.join(files::MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
     }
 
-    /// Returns which models the current generation was encoded with, if the store recorded it.
+    /// Models of the current generation, if the store recorded them.
     pub(crate) fn models(&self) -> Result<Option<ModelsRecord>, StoreError> {
         let record = ModelsRecord::read(&self.dir)?;
         Ok(record.filter(|record| record.encoder == self.manifest().encoder.id))
@@ -139,7 +138,6 @@ impl StoreReader {
         &self.current
     }
 
-    /// Returns the generation before it, if there was one.
     pub(crate) fn previous(&self) -> Option<&Published> {
         self.previous.as_ref()
     }
@@ -148,7 +146,7 @@ impl StoreReader {
         &self.current.manifest
     }
 
-    /// Returns where an object lies, whether or not it is there.
+    /// Path of an object, which need not exist.
     pub(crate) fn object_path(&self, hash: Hash32) -> PathBuf {
         object_path(&self.dir, hash)
     }
@@ -193,13 +191,13 @@ pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
     dir.join("extras").join(manifest_hash.to_string())
 }
 
-/// Returns whether something was published into a store, whatever became of it.
+/// Whether anything was ever published into a store.
 fn was_published(dir: &Path) -> bool {
     [files::MANIFEST_PREVIOUS, "metadata/timestamp.json"].iter().any(|name| dir.join(name).exists())
 }
 
-/// Returns the name of the scene that a store publishes; of the generation before where the current one cannot be
-/// read, and `None` where neither can.
+/// Name of a store's published scene, from the previous generation if the current one cannot be read; `None` if neither
+/// can.
 pub(crate) fn scene_name(dir: &Path) -> Option<String> {
     let read = |name: &str| read_manifest(&dir.join(name)).ok();
     let (manifest, _) = read(files::MANIFEST).or_else(|| read(files::MANIFEST_PREVIOUS))?;

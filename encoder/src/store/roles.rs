@@ -19,10 +19,9 @@ use slag_common::tuf::{Body, Key, RoleKeys, Root, generate_key};
 use super::error::StoreError;
 use super::files::{self, Access};
 
-/// The roles whose keys lie with the store.
+/// Roles whose keys lie with the store.
 pub(super) const ONLINE: [&str; 3] = ["targets", "snapshot", "timestamp"];
 
-/// Returns where a store's root keys lie unless they are kept elsewhere.
 pub(crate) fn root_folder(store: &Path) -> PathBuf {
     store.join("keys").join("root")
 }
@@ -40,8 +39,8 @@ pub(super) fn read(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
     Err(StoreError::Key { path, what, help })
 }
 
-/// Makes the keys of all roles that have none, and returns the body of a root that names them and root's keys.
-/// `n_root_keys`: in `root_folder`.
+/// Makes missing keys of all roles, and returns the body of a root with them and root's keys, `n_root_keys` in
+/// `root_folder`.
 pub(super) fn make_all(
     store: &Path,
     root_folder: &Path,
@@ -69,7 +68,7 @@ pub(super) fn make_all(
     Ok((Root { consistent_snapshot: true, keys, roles }, root_keys))
 }
 
-/// Checks the keys that lie there before the first root.
+/// Checks existing keys before the first root.
 pub(super) fn check_before_root(store: &Path) -> Result<(), StoreError> {
     read_folder(&root_folder(store)).map_err(before_root)?;
     let is_damaged = |role: &&str| matches!(KeyFile::read(&key_path(store, role)), Ok(KeyFile::Damaged));
@@ -88,12 +87,12 @@ fn before_root(error: StoreError) -> StoreError {
     }
 }
 
-/// Reads all keys of root in a folder, by name; none if the folder is not there.
+/// All root keys in a folder, by name; none without the folder.
 pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
     read_all(folder, Err)
 }
 
-/// As [`read_folder`], without those that are damaged: these are warned of.
+/// As [`read_folder`], without damaged keys, which are warned of.
 pub(super) fn read_sound(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
     read_all(folder, |error| {
         tracing::warn!("{error}");
@@ -128,7 +127,7 @@ pub(super) fn make_root_key(folder: &Path) -> Result<SigningKey, StoreError> {
     read_or_make(&path.unwrap_or_else(|| folder.join("0.key")))
 }
 
-/// Makes the key that a role will have, unless there is one that can sign.
+/// Makes a role's next key, unless there is one that can sign.
 pub(super) fn make_next(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
     let path = next_path(store, role);
     if matches!(KeyFile::read(&path)?, KeyFile::Damaged) {
@@ -137,7 +136,7 @@ pub(super) fn make_next(store: &Path, role: &str) -> Result<SigningKey, StoreErr
     read_or_make(&path)
 }
 
-/// Puts a role's next key in place of its key, if a root names it.
+/// Replaces a role's key by its next one, if a root names that.
 pub(super) fn promote(store: &Path, role: &str, root: &Root) -> Result<(), StoreError> {
     let KeyFile::Key(next) = KeyFile::read(&next_path(store, role))? else { return Ok(()) };
     if root.roles[role].keyids.contains(&Key::of(&next).id()) {
@@ -172,13 +171,11 @@ fn read_or_make(path: &Path) -> Result<SigningKey, StoreError> {
 
 const DAMAGED: &str = "it is damaged: expected 64 hex digits";
 
-/// Says that a key is damaged which cannot be made anew.
 fn damaged(path: PathBuf) -> StoreError {
     let help = "restore it from a backup, or move it away if root's other keys are enough (`slag-encoder keys status` tells the threshold)";
     StoreError::Key { path, what: DAMAGED, help: help.into() }
 }
 
-/// What a file has in which a key should be.
 enum KeyFile {
     Key(Box<SigningKey>),
     Missing,
@@ -186,7 +183,6 @@ enum KeyFile {
 }
 
 impl KeyFile {
-    /// Reads 32 bytes of hex and a line end.
     fn read(path: &Path) -> Result<Self, StoreError> {
         let file = match fs_err::File::open(path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Self::Missing),

@@ -11,7 +11,7 @@ use slag_common::shard::Profile;
 use super::metadata::Metadata;
 use super::*;
 
-/// Ways in which a file is damaged: lost, empty, cut, changed near its beginning.
+/// Ways to damage a file: lost, empty, cut, changed near its beginning.
 pub(crate) const DAMAGES: [fn(&Path); 4] = [
     |path| fs_err::remove_file(path).expect("there"),
     |path| fs_err::write(path, b"").expect("writable"),
@@ -26,7 +26,6 @@ pub(crate) const DAMAGES: [fn(&Path); 4] = [
     },
 ];
 
-/// A manifest of cells without shards.
 pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
     let cell = |(cell_id, bounds): (usize, &Aabb)| CellRecord {
         cell_id: cell_id as u32,
@@ -56,7 +55,7 @@ pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
     }
 }
 
-/// A manifest whose cells list the given objects, one a cell, in a row along x.
+/// A manifest with one cell per object, in a row along x.
 pub(crate) fn manifest(generation: u64, objects: &[(Hash32, u64)]) -> Manifest {
     let unit_box = |i: usize| {
         let min = DVec3::X * (10 * i) as f64;
@@ -240,8 +239,7 @@ fn records_behind_the_manifest_are_repaired() {
     assert_eq!(fs_err::read_dir(dir.path().join("tmp")).expect("folder").count(), 0);
 }
 
-/// Each step but the last can fail, and the generation before it stays, whole: so a crash there is
-/// harmless too.
+/// Each step but the last can fail and leaves the previous generation whole, so a crash there is harmless, too.
 #[test]
 fn publication_that_fails_on_its_way_changes_nothing() {
     for obstacle in ["extras", "manifest.previous"] {
@@ -249,7 +247,7 @@ fn publication_that_fails_on_its_way_changes_nothing() {
         let store = Store::create_or_open(dir.path()).expect("opens");
         let shards = put_many(&store, &["a", "b"]);
         let hash = store.publish(&manifest(1, &shards[..1]), &Extras::new()).expect("publishes");
-        // A file cannot be written where its folder is none, nor renamed onto a folder that is not empty.
+        // A file cannot be written below a file, nor renamed onto a folder that is not empty.
         let (path, aside) = (dir.path().join(obstacle), dir.path().join("aside"));
         match obstacle {
             "extras" => {
@@ -272,7 +270,7 @@ fn publication_that_fails_on_its_way_changes_nothing() {
     }
 }
 
-/// Publishes without end; run in a process of its own by the test below, which kills it.
+/// Publishes without end, in a process that the test below kills.
 #[test]
 #[ignore = "the process that the kill test starts"]
 fn publish_until_killed() {
@@ -289,7 +287,7 @@ fn publish_until_killed() {
     }
 }
 
-/// SIGKILL at any moment leaves a whole generation, never an older one than was seen before.
+/// SIGKILL at any moment leaves a whole generation, none older than seen before.
 #[test]
 fn killed_writer_leaves_a_whole_generation() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -302,7 +300,7 @@ fn killed_writer_leaves_a_whole_generation() {
             .stderr(std::process::Stdio::null())
             .spawn()
             .expect("starts");
-        // Lets it publish at least one generation more, then kills at a spread of phases.
+        // Waits for at least one more generation, then kills at a spread of phases.
         while !StoreReader::open(dir.path()).is_ok_and(|r| r.manifest().generation > last_generation) {
             assert!(child.try_wait().expect("a child").is_none(), "the writer stopped by itself");
             std::thread::sleep(std::time::Duration::from_micros(500));
@@ -341,7 +339,7 @@ fn damaged_extras_do_not_keep_a_writer_out() {
     assert_eq!(StoreReader::open(dir.path()).expect("reads").manifest().generation, 2);
 }
 
-/// A record of another encoder, which an interrupted encode left behind, says nothing of what is published.
+/// A record of another encoder, from an interrupted encode, says nothing of what is published.
 #[test]
 fn models_are_remembered_for_their_encoder_alone() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -387,7 +385,7 @@ fn verification_reads_every_byte_and_names_what_is_bad() {
 }
 
 /// A manifest that is cut, empty, changed or lost: readers say what helps, and the next encode does it. Fetches under
-/// way keep the generation before.
+/// way keep the previous generation.
 #[test]
 fn a_damaged_manifest_is_published_anew() {
     for (number, damage) in DAMAGES.iter().enumerate() {
@@ -413,7 +411,7 @@ fn a_damaged_manifest_is_published_anew() {
     }
 }
 
-/// What a program of another version wrote is no damage, and is not written over.
+/// What another version wrote is no damage, and is not overwritten.
 #[test]
 fn a_manifest_of_another_version_is_kept() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -426,7 +424,7 @@ fn a_manifest_of_another_version_is_kept() {
     fs_err::write(&path, later).expect("written");
     let refused = Store::create_or_open(dir.path()).expect_err("another version");
     assert!(refused.to_string().contains("matching versions"), "{refused}");
-    // One of this version's number with a member that this program does not know, which is signed.
+    // The same version number with a signed member that this program does not know.
     let later = ours.replacen('{', "{\"later\":1,", 1);
     fs_err::write(&path, &later).expect("written");
     Store::create_or_open(dir.path()).expect("it is not signed: damage");

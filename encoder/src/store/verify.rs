@@ -50,12 +50,12 @@ pub(crate) struct Verified {
 
 pub(crate) struct Listing<'a> {
     reader: &'a StoreReader,
-    /// What each holds, by hash and length if a manifest states it.
+    /// Content of each, by hash and length if a manifest states it.
     holds: BTreeMap<(Hash32, Option<u64>), Vec<String>>,
 }
 
 impl StoreReader {
-    /// Lists the objects of the current generation and the one before it.
+    /// Objects of the current and the previous generation.
     pub(crate) fn listing(&self) -> Listing<'_> {
         let mut holds: BTreeMap<_, Vec<String>> = BTreeMap::new();
         for published in std::iter::once(self.current()).chain(self.previous()) {
@@ -103,7 +103,7 @@ impl Listing<'_> {
     }
 }
 
-/// Lists the objects of a generation: hash, length if the manifest states it, and content.
+/// A generation's objects: hash, length if the manifest states it, and content.
 pub(super) fn contents(manifest: &Manifest, extras: &Extras) -> Vec<(Hash32, Option<u64>, String)> {
     let shards = manifest.cells.iter().flat_map(|cell| {
         let of_profile = |(profile, shard): (&_, &ShardRecord)| {

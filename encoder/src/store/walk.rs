@@ -12,20 +12,18 @@ use super::error::{StoreError, metadata_fault, metadata_help};
 use super::files;
 use super::metadata::{TIMESTAMP_FILE, clock_unix_secs, folder, names, read_published};
 
-/// Times that metadata is read before a fault counts, and the pause between: an encode or a refresh replaces it file
-/// by file.
+/// Reads of metadata before a fault counts, with a pause between them: an encode or refresh replaces it file by file.
 pub(super) const N_TRIES: usize = 3;
 pub(super) const PAUSE: Duration = Duration::from_millis(if cfg!(test) { 1 } else { 200 });
 
-/// A file that robots refuse.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Refused {
     pub(super) path: PathBuf,
-    /// What is wrong with it, and what helps.
+    /// The fault, and what helps.
     pub(super) what: String,
 }
 
-/// The files of a store's metadata by name; the error of one that cannot be read.
+/// A store's metadata files by name, or the error of reading one.
 pub(super) type MetadataFiles = BTreeMap<String, Result<Vec<u8>, TufError>>;
 
 pub(super) fn read_all(store: &Path) -> Result<MetadataFiles, StoreError> {
@@ -40,7 +38,7 @@ pub(super) fn read_all(store: &Path) -> Result<MetadataFiles, StoreError> {
     Ok(found)
 }
 
-/// Returns what a robot would refuse of a store now.
+/// What a robot would refuse of a store now.
 pub(super) fn refused(store: &Path) -> Result<Vec<Refused>, StoreError> {
     let mut n_tries = 0;
     loop {
@@ -55,7 +53,6 @@ pub(super) fn refused(store: &Path) -> Result<Vec<Refused>, StoreError> {
     }
 }
 
-/// Returns what a robot would refuse of some metadata and a manifest.
 pub(super) fn refused_of(
     store: &Path,
     metadata: &MetadataFiles,
@@ -64,7 +61,7 @@ pub(super) fn refused_of(
 ) -> Vec<Refused> {
     let mut walk = Walk { store, metadata, found: Vec::new() };
     if let Some(mut trusted) = walk.roots(now_unix_secs) {
-        // The first refusal ends a robot's fetch, and nothing after it can be told.
+        // The first refusal ends a robot's fetch, and nothing after it is known.
         let _ = walk.follow(&mut trusted, manifest);
     }
     walk.found
@@ -76,12 +73,12 @@ struct Walk<'a> {
     found: Vec<Refused>,
 }
 
-/// What ended a walk was noted.
+/// The walk ended; the reason is recorded.
 struct Ended;
 
 impl Walk<'_> {
-    /// Follows all roots: robots may know any of them, and new ones ask for the first. Returns the newest one, unless
-    /// it is refused.
+    /// Follows all roots: robots may know any of them, and new ones ask for the first. Returns the newest, unless
+    /// refused.
     fn roots(&mut self, now_unix_secs: u64) -> Option<Trusted> {
         let version = |name: &String| name.strip_suffix(".root.json")?.parse::<u64>().ok();
         let mut versions: Vec<u64> = self.metadata.keys().filter_map(version).collect();
@@ -134,7 +131,6 @@ impl Walk<'_> {
         }
     }
 
-    /// Notes that a file is refused.
     fn refuse(&mut self, At { name, cause }: &At) -> Ended {
         let fault = metadata_fault(cause);
         let refused = if name == TARGET {
@@ -154,7 +150,7 @@ impl Walk<'_> {
     }
 }
 
-/// A file of metadata, or the manifest, and why it is refused.
+/// A metadata file or the manifest, and why it is refused.
 struct At {
     name: String,
     cause: TufError,

@@ -10,7 +10,7 @@ use super::metadata_tests::{client, follow, publish_in as publish};
 use super::tests::DAMAGES;
 use super::{Fault, StoreError, StoreReader, export, walk};
 
-/// Returns a store with two generations and two roots, whose timestamp was refreshed.
+/// A store with two generations and two roots, and a refreshed timestamp.
 fn store() -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("temporary folder");
     publish(dir.path(), 1).expect("publishes");
@@ -32,7 +32,7 @@ fn newest(dir: &Path, role: &str) -> PathBuf {
     newest.unwrap_or_else(|| folder.join(format!("{role}.json")))
 }
 
-/// Each file that a robot needs, removed, cut and changed: `verify` names it and says what helps, and `export` writes
+/// Each file that a robot needs, removed, cut and changed: `verify` names it and what helps, and `export` writes
 /// nothing.
 #[test]
 fn what_robots_would_refuse_is_told() {
@@ -49,7 +49,7 @@ fn what_robots_would_refuse_is_told() {
             let reader = StoreReader::open(sound.path()).expect("published");
             let bad = reader.listing().verify(|| {}).bad;
             assert_eq!(bad.len(), 1, "{case}: {bad:?}");
-            // A newest root that is gone shows in what its keys signed.
+            // A missing newest root shows in what its keys signed.
             let is_gone_root = number == 0 && path.ends_with("2.root.json");
             assert!(is_gone_root || bad[0].path == *path, "{case}: {bad:?}");
             let Fault::Refused(what) = &bad[0].fault else { panic!("{case}: {bad:?}") };
@@ -107,7 +107,7 @@ fn metadata_is_signed_anew_and_no_version_goes_back() {
     }
 }
 
-/// Without any root, a new one would take the place of that which robots trust: this is for people to decide.
+/// A new root would replace the one that robots trust: people must decide this.
 #[test]
 fn a_lost_root_is_not_made_anew_in_silence() {
     let dir = store();

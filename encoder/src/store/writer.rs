@@ -17,7 +17,7 @@ use super::metadata::Metadata;
 use super::reader::{self, Extras, Published, StoreReader};
 use super::verify;
 
-/// Time to wait for the lock: sled releases the lock of a writer that has just ended on a thread of its own.
+/// sled releases the lock of a writer that has just ended on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
@@ -26,13 +26,12 @@ pub struct Pruned {
     pub len_bytes: u64,
 }
 
-/// The only writer of a store.
 #[derive(Debug)]
 pub struct Store {
     pub(super) dir: PathBuf,
     catalogue: Catalogue,
     n_parts: AtomicU64,
-    /// Objects whose content this writer has hashed.
+    /// Objects that this writer has hashed.
     read: Mutex<BTreeSet<Hash32>>,
 }
 
@@ -52,7 +51,7 @@ impl Store {
         }
         files::sync_folder(&dir.join("objects"))?;
         let catalogue = Catalogue::open(dir, LOCK_PATIENCE)?;
-        // The lock is held, so the files in tmp/ belong to a writer that died.
+        // The lock is held, so files in tmp/ belong to a dead writer.
         for entry in fs_err::read_dir(dir.join("tmp"))? {
             fs_err::remove_file(entry?.path())?;
         }
@@ -66,7 +65,7 @@ impl Store {
         &self.dir
     }
 
-    /// Returns the folder for working files of an encode, and creates it if it does not exist.
+    /// Folder for working files of an encode, created if missing.
     pub(crate) fn job_dir(&self) -> Result<PathBuf, StoreError> {
         let path = self.dir.join("job");
         files::ensure_folder(&path)?;
@@ -78,7 +77,7 @@ impl Store {
         &self.catalogue
     }
 
-    /// Returns the record database, for the state of jobs and pushes. Records are durable once flushed.
+    /// Record database, for the state of jobs and pushes. Records are durable once flushed.
     pub fn db(&self) -> &sled::Db {
         self.catalogue.db()
     }
@@ -87,10 +86,8 @@ impl Store {
         StoreReader::open(&self.dir)
     }
 
-    /// Writes an object through a callback and returns its hash and length; safe from many threads.
-    ///
-    /// The object is durable on return. An object that is there already is kept if its content has its hash, else
-    /// replaced.
+    /// Writes an object through a callback; returns its hash and length. Safe from many threads, durable on return. An
+    /// existing object is kept if its content has its hash, else replaced.
     pub(crate) fn put_object(
         &self,
         write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
@@ -134,16 +131,14 @@ impl Store {
         Ok(self.catalogue.last_generation()?.map_or(1, |current| current.saturating_add(1)))
     }
 
-    /// Checks that the keys are there that sign the next generation.
+    /// The keys that sign the next generation must be there.
     pub(crate) fn check_keys(&self) -> Result<(), StoreError> {
         Metadata::open(&self.dir)?.check_keys()
     }
 
-    /// Signs a manifest and makes it, with the objects it lists, the current one; returns its hash.
-    ///
-    /// `extras`: objects by name that this generation needs but robots do not fetch (readers find them
-    /// in [`Published::extras`]). Publishing the current manifest once more changes nothing. The next
-    /// key that it names is the store's, whatever `manifest` says.
+    /// Signs a manifest and makes it, with its objects, the current one; returns its hash. Publishing the current
+    /// manifest again changes nothing. Its next key is the store's, whatever `manifest` says. `extras`: objects by name
+    /// that this generation needs but robots do not fetch (readers find them in [`Published::extras`]).
     ///
     /// # Errors
     /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is damaged,
@@ -159,7 +154,7 @@ impl Store {
         let hash = Hash32::of(&bytes);
         let current = match files::read_manifest_bytes(&path) {
             Err(StoreError::Manifest { .. }) => None,
-            // A damaged one serves no fetch under way: the one before it stays.
+            // A damaged one serves no fetch under way: the previous one stays.
             current => current?.filter(|bytes| Manifest::parse(bytes).is_ok()),
         };
         let again = current.as_deref() == Some(&bytes);
@@ -187,9 +182,8 @@ impl Store {
         self.replace(&ModelsRecord::path(&self.dir), &bytes)
     }
 
-    /// Removes objects and extras that neither the current manifest nor the one before it lists.
-    ///
-    /// Objects of an encode that has not published yet are removed too: prune after publishing.
+    /// Removes objects and extras that neither the current nor the previous manifest lists, including those of an
+    /// encode that has not published yet: prune after publishing.
     pub fn prune(&self) -> Result<Pruned, StoreError> {
         let reader = self.reader()?;
         let both = || std::iter::once(reader.current()).chain(reader.previous());
@@ -214,9 +208,9 @@ impl Store {
         Ok(pruned)
     }
 
-    /// Brings metadata and catalogue up to the manifests, which a crash may have left ahead of them.
+    /// Updates metadata and catalogue to the manifests, which a crash may have left ahead of them.
     fn repair_records(&self) -> Result<(), StoreError> {
-        // Without the extras: a damaged record of them is replaced by the next publication.
+        // Without the extras: the next publication replaces a damaged record of them.
         let read = |name: &str| reader::read_manifest(&self.dir.join(name));
         // It only serves fetches under way.
         if let Ok((manifest, bytes)) = read(files::MANIFEST_PREVIOUS) {
@@ -238,7 +232,7 @@ impl Store {
         Ok(())
     }
 
-    /// Refuses a manifest that cannot be read but is not damaged: a program of another version goes on from it.
+    /// Refuses an unreadable but undamaged manifest, which belongs to another version of the program.
     fn check_is_damaged(&self, path: &Path, cause: &ManifestError) -> Result<(), StoreError> {
         let (path, cause) = (path.to_owned(), cause.clone());
         match &cause {
@@ -262,7 +256,7 @@ impl Store {
         };
         let is_read = self.read.lock().unwrap_or_else(PoisonError::into_inner).contains(&hash);
         let found = match is_read {
-            // Written or read by this writer: only its being there is in question.
+            // Written or read by this writer: only its presence is in question.
             true => fs_err::metadata(&path).map(|found| (hash, found.len())),
             false => files::hash_of(&path),
         };

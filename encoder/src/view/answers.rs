@@ -17,16 +17,16 @@ const SPREADS_ABOVE_MEAN: f32 = 3.0;
 /// Relevancy from which a question with negatives is answered, as on robots.
 const RELEVANCY_THRESHOLD: f32 = 0.5;
 
-/// The things that are scored in a shard.
+/// Things that are scored in a shard.
 struct ThingsHere {
     shard: StoredShard,
-    /// Their numbers among the shard's objects.
+    /// Indices among the shard's objects.
     numbers: Vec<usize>,
     /// Whether a shard of the cell may have their pictures.
     have_thumbnails: bool,
 }
 
-/// The things of a generation: each is scored in the first shard that has it.
+/// A generation's things, each scored in the first shard that has it.
 #[derive(Default)]
 pub(crate) struct Things {
     shards: Vec<ThingsHere>,
@@ -35,7 +35,7 @@ pub(crate) struct Things {
 }
 
 impl Things {
-    /// Finds the things of a published store in the smallest shard of each cell. `look`: is shown these, too.
+    /// Finds a store's things in the smallest shard of each cell. `look` gets these shards, too.
     pub(crate) fn open(reader: &StoreReader, mut look: impl FnMut(&StoredShard)) -> Result<Self, ViewError> {
         let mut things = Self::default();
         for cell in &reader.manifest().cells {
@@ -47,7 +47,6 @@ impl Things {
         Ok(things)
     }
 
-    /// Adds the objects of the next cell's smallest shard.
     fn add(&mut self, cell: &CellRecord, shard: StoredShard) {
         let Some(objects) = shard.objects() else { return };
         let have_thumbnails = objects.thumbnails.is_some() || cell.shards.len() > 1;
@@ -60,7 +59,7 @@ impl Things {
         }
     }
 
-    /// Returns the id of the cell whose shard scores a thing.
+    /// Cell whose shard scores a thing.
     pub(super) fn cell_of(&self, id: u64) -> Option<u32> {
         let is_here = |of: &&ThingsHere| {
             let records = of.shard.objects().map_or(&[][..], |objects| objects.records);
@@ -69,7 +68,7 @@ impl Things {
         self.shards.iter().find(is_here).map(|of| of.shard.layout.header.cell_id)
     }
 
-    /// Returns the score from which a thing answers a question with negatives, or one without.
+    /// Score from which a thing answers a question, with or without negatives.
     pub(crate) fn threshold(&self, manifest: &Manifest, has_negatives: bool) -> f32 {
         let encoder = &manifest.encoder;
         match self.calibration.filter(|_| encoder.calibration.is_some()) {
@@ -79,7 +78,7 @@ impl Things {
         }
     }
 
-    /// Returns the best name of each thing with its confidence. `words`: with their vectors.
+    /// Best name of each thing, with its confidence. `words`: with their vectors.
     pub(super) fn best_names<'a>(
         &self,
         manifest: &Manifest,
@@ -104,7 +103,7 @@ impl Things {
         of_things.iter().filter_map(best).map(|(word, of)| (words[word as usize].0, of)).collect()
     }
 
-    /// Answers a question, the first of `vectors`, against its negatives.
+    /// Answers the first of `vectors` against the others, its negatives.
     pub(super) fn answers(
         &self,
         manifest: &Manifest,
@@ -131,7 +130,7 @@ impl Things {
         }] })
     }
 
-    /// Returns the things that reach a score, best first.
+    /// Things at or above a score, best first.
     pub(crate) fn matching(&self, vectors: &[Vec<f32>], threshold: f32, limit: usize) -> Vec<Found> {
         let mut found: Vec<Found> = Vec::new();
         for ThingsHere { shard, numbers, have_thumbnails } in &self.shards {
@@ -152,7 +151,6 @@ impl Things {
     }
 }
 
-/// A thing that matches.
 pub(crate) struct Found {
     pub(crate) score: f32,
     pub(crate) record: ObjectRecord,
@@ -161,7 +159,7 @@ pub(crate) struct Found {
 }
 
 impl Found {
-    /// Returns the answer as the page reads it.
+    /// As the page reads it.
     pub(crate) fn answer(&self, manifest: &Manifest, rank: usize) -> Value {
         let Self { score, record, photo, has_thumbnail } = self;
         let (position, bounds) = (record.position(), record.bounds());

@@ -16,14 +16,13 @@ use crate::store::{StoreReader, StoredShard};
 pub(super) struct Generation {
     pub(super) reader: StoreReader,
     pub(super) things: Things,
-    /// Photos whose poses were published.
+    /// Photos with published poses.
     photos: Vec<Photo>,
     scored: Scored,
 }
 
-/// Where scores come from; the order of a cell's Gaussians follows.
+/// Source of scores; it determines the order of a cell's Gaussians.
 enum Scored {
-    /// The published fields, in full precision.
     Fields(RegionTable, Vec<CellField>),
     /// The smallest shards' centroids.
     Shards,
@@ -102,7 +101,6 @@ impl Generation {
         }
     }
 
-    /// Returns the small picture of a thing, a JPEG file.
     pub(super) fn thumbnail(&self, id: u64) -> Result<Option<Vec<u8>>, ViewError> {
         let cell_id = self.things.cell_of(id);
         let cell = self.reader.manifest().cells.iter().find(|cell| Some(cell.cell_id) == cell_id);
@@ -115,8 +113,7 @@ impl Generation {
         Ok(shard.and_then(of_shard))
     }
 
-    /// Returns the message of every Gaussian's score with a question, the first of `vectors`, against its
-    /// negatives.
+    /// Message with every Gaussian's score for the first of `vectors` against the others, its negatives.
     pub(super) fn scores(&self, vectors: &[Vec<f32>]) -> Result<Vec<u8>, ViewError> {
         let manifest = self.reader.manifest();
         let of_cells: Vec<Vec<f32>> = match &self.scored {
@@ -136,7 +133,7 @@ impl Generation {
                 manifest.cells.par_iter().map(scores).collect::<Result<_, ViewError>>()?
             }
         };
-        // Of a NaN and a number, the minimum is the number.
+        // The minimum of NaN and a number is the number.
         let all = || of_cells.iter().flatten().copied();
         let range = [all().fold(f32::NAN, f32::min), all().fold(f32::NAN, f32::max)];
         let range = if range[0].is_nan() { [0.0; 2] } else { range };

@@ -1,8 +1,7 @@
 //! What the page at `/view` draws: a published store, a splat, or both.
 //!
-//! With the splat, Gaussians are in the order of the published fields and scored in full precision; without it,
-//! they are in the order of the smallest shards and have the scores of their centroids, as on a robot. A splat
-//! alone can be drawn, not asked.
+//! With the splat, Gaussians are in the order of the published fields and scored in full precision; without it, in the
+//! order of the smallest shards with their centroids' scores, as on a robot. A splat alone can be drawn, not asked.
 
 mod answers;
 mod error;

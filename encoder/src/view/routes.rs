@@ -18,7 +18,7 @@ use super::error::ViewError;
 use super::viewer::Viewer;
 use crate::diff::Diff;
 
-/// Answers in a page of `/v1/query` unless the request says otherwise.
+/// Answers per page of `/v1/query` by default.
 const DEFAULT_LIMIT: usize = 10;
 const MAX_LIMIT: usize = 1000;
 const MAX_NEGATIVES: usize = 32;
@@ -93,12 +93,10 @@ async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Pro
     blocking(viewer, work).await.map(Json)
 }
 
-/// Compares the published generation with the one before it.
 async fn changes(State(viewer): AppState) -> Result<Json<Diff>, Problem> {
     blocking(viewer, |viewer| viewer.changes()).await.map(Json)
 }
 
-/// Sends the small picture of a thing, by its id.
 async fn thumbnail(State(viewer): AppState, PathText(id): PathText) -> Result<Response, Problem> {
     let wanted = parse_public_id(&id).ok_or_else(|| bad("id: expected o and 16 hex digits"))?;
     let picture = blocking(viewer, move |viewer| viewer.thumbnail(wanted)).await?;
@@ -109,7 +107,7 @@ async fn thumbnail(State(viewer): AppState, PathText(id): PathText) -> Result<Re
     Ok(([(header::CONTENT_TYPE, "image/jpeg")], picture.ok_or_else(gone)?).into_response())
 }
 
-/// Sends a photo as it lies on disk, by its number in the description.
+/// A photo as it lies on disk, by its index in the description.
 async fn photo(State(viewer): AppState, PathText(number): PathText) -> Result<Response, Problem> {
     let number: usize = self::number("number", &number)?;
     let path = viewer.photo(number);
@@ -130,7 +128,7 @@ fn bad(detail: impl Into<String>) -> Problem {
     Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", detail)
 }
 
-/// Returns the parameters; refuses unknown ones.
+/// Refuses unknown parameters.
 fn read(pairs: Pairs, known: &[&str]) -> Result<Vec<(String, String)>, Problem> {
     let Query(pairs) = pairs.map_err(|e| bad(e.body_text()))?;
     match pairs.iter().find(|(name, _)| !known.contains(&name.as_str())) {

@@ -13,7 +13,7 @@ pub(super) fn photos_of(shard: &StoredShard) -> Vec<Photo> {
     photos.into_iter().flat_map(|photos| Photo::of_shard(origin, photos)).collect()
 }
 
-/// Returns the score of each Gaussian's centroid; NaN without one.
+/// Score of each Gaussian's centroid; NaN without one.
 pub(super) fn scores_of(shard: &StoredShard, vectors: &[Vec<f32>]) -> Vec<f32> {
     let view = shard.view();
     let of_centroids = combined(vectors.iter().map(|vector| view.centroid_scores(vector)).collect());
@@ -24,8 +24,8 @@ pub(super) fn scores_of(shard: &StoredShard, vectors: &[Vec<f32>]) -> Vec<f32> {
     scores
 }
 
-/// Combines the scores of a question with those of its negatives: the relevancy (LERF, Kerr et al. 2023, section
-/// 3.3), or the question's own where there are none.
+/// Combines a question's scores with its negatives' into the relevancy (LERF, Kerr et al. 2023, section 3.3); without
+/// negatives, the question's own.
 pub(super) fn combined(mut of_vectors: Vec<Vec<f32>>) -> Vec<f32> {
     let mut own = of_vectors.swap_remove(0);
     if !of_vectors.is_empty() {
@@ -44,8 +44,7 @@ pub(super) fn smallest_shard(
     cell.shards.values().next().map(|record| reader.read_shard(record)).transpose()
 }
 
-/// Reads a cell's smallest shard that tells how its Gaussians look, or else the smallest. The order of Gaussians is the
-/// same in all.
+/// A cell's smallest shard with appearance, or else the smallest. All have the same order of Gaussians.
 pub(super) fn smallest_with_appearance(
     reader: &StoreReader,
     cell: &CellRecord,

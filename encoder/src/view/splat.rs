@@ -9,11 +9,10 @@ use super::error::ViewError;
 use crate::cells::{self, CellLimits, CellSplit};
 
 pub(super) const PROGRAM: &str = "slag-encoder";
-/// Gaussians of a cell where a splat is shown alone: the first cell is small enough for a first picture within a
-/// second.
+/// Gaussians per cell of a splat shown alone: small enough for a first picture within a second.
 const MAX_GAUSSIANS: usize = 65_536;
 
-/// A splat, cut into cells of its own where there is no store.
+/// A splat, cut into its own cells if there is no store.
 pub(crate) struct Splat {
     name: String,
     pub(super) scene: Gaussians,
@@ -21,7 +20,7 @@ pub(crate) struct Splat {
 }
 
 impl Splat {
-    /// Takes a splat; `is_alone`: there is no store whose cells count.
+    /// `is_alone`: there is no store whose cells count.
     pub(crate) fn new(name: String, scene: Gaussians, is_alone: bool) -> Self {
         let limits = CellLimits::by_count(MAX_GAUSSIANS);
         let split = match is_alone {
@@ -37,7 +36,7 @@ impl Splat {
             n_gaussians: cell.gaussians.len() as u32,
             state: CellState::OnBoard,
             generation: 0,
-            // Not of the extents: those of a few huge Gaussians of the sky would be the whole picture.
+            // Not of the extents: a few huge Gaussians of the sky would fill the picture.
             box_m: cell.mean_bounds.into(),
         });
         Description {
@@ -56,13 +55,12 @@ impl Splat {
         }
     }
 
-    /// Returns the message of one of the splat's own cells.
     pub(super) fn cell(&self, cell_id: u32, step: Step) -> Result<Vec<u8>, ViewError> {
         let cell = self.split.cells.get(cell_id as usize).ok_or(ViewError::NoCell { cell_id })?;
         Ok(self.message(&cell.gaussians, step))
     }
 
-    /// Returns the message of a cell with these Gaussians.
+    /// Message of a cell with these Gaussians.
     ///
     /// # Panics
     /// If an index is not one of the splat.

@@ -17,7 +17,7 @@ use super::splat::Splat;
 use crate::diff::{self, Diff};
 use crate::store::StoreReader;
 
-/// Time after which a request encodes no further word: questions wait meanwhile.
+/// A request encodes no further word after this time, because questions wait meanwhile.
 const ENCODING: Duration = Duration::from_millis(500);
 
 /// Opens the text encoder of a store; the error says what to do.
@@ -25,27 +25,26 @@ pub(crate) type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncode
 
 pub(crate) struct Viewed {
     pub(crate) store: Option<PathBuf>,
-    /// The splat; of the store, if there is one.
+    /// The store's, if there is one.
     pub(crate) splat: Option<Splat>,
-    /// The photos, in the world of the splat.
+    /// In the world of the splat.
     pub(crate) views: Vec<View>,
     /// Upward; the world's z if absent.
     pub(crate) up: Option<Vec3>,
-    /// Opens the store's text encoder, at the first question.
+    /// Called at the first question.
     pub(crate) open_text: OpenText,
 }
 
 struct OpenedText {
     id: Hash32,
     encoder: Box<dyn TextEncoder>,
-    /// The words that things are named by, and their vectors as far as they were needed; `None` of one that the model
-    /// does not know.
+    /// Words that name things, with their vectors as far as needed; `None` for words unknown to the model.
     words: Vec<String>,
     vectors: Vec<Option<Vec<f32>>>,
 }
 
 impl OpenedText {
-    /// Encodes some more words; returns whether all are encoded.
+    /// Encodes more words; returns whether all are encoded.
     fn encode_words(&mut self) -> bool {
         let started = Instant::now();
         while let Some(word) = self.words.get(self.vectors.len()) {
@@ -64,7 +63,7 @@ impl OpenedText {
 
 pub(crate) struct Viewer {
     shown: Viewed,
-    /// Locked while another generation is opened, so that one request opens it.
+    /// Locked while another generation is opened, so that only one request opens it.
     generation: Mutex<Option<Arc<Generation>>>,
     /// Locked while a question is scored: one at a time bounds memory.
     text: Mutex<Option<OpenedText>>,
@@ -75,8 +74,7 @@ impl Viewer {
         Self { shown, generation: Mutex::default(), text: Mutex::default() }
     }
 
-    /// Returns the store's current generation; blocks while it is read. A generation that does not open leaves the
-    /// one before.
+    /// The store's current generation; blocks while it is read. One that fails to open leaves the previous one.
     fn generation(&self) -> Result<Arc<Generation>, ViewError> {
         let Some(store) = &self.shown.store else { return Err(ViewError::NoStore) };
         let mut opened = locked(&self.generation);
@@ -109,14 +107,13 @@ impl Viewer {
         if let Some(up) = self.shown.up.filter(|_| !description.metric) {
             description.up = up;
         }
-        // Photos that are at hand count more than published poses: they have pictures.
+        // Photos take precedence over published poses: they have pictures.
         if !self.shown.views.is_empty() {
             description.views = self.shown.views.iter().map(photo).collect();
         }
         Ok(description)
     }
 
-    /// Compares the store's current generation with the one before it.
     pub(super) fn changes(&self) -> Result<Diff, ViewError> {
         let generation = self.generation()?;
         let reader = &generation.reader;
@@ -141,12 +138,12 @@ impl Viewer {
         self.generation()?.thumbnail(id)
     }
 
-    /// Returns the file of a photo, by its number in the description.
+    /// File of a photo, by its index in the description.
     pub(super) fn photo(&self, number: usize) -> Option<PathBuf> {
         self.shown.views.get(number).map(|view| view.image_path.clone())
     }
 
-    /// Runs work on a question and its negatives as vectors of the current generation's space.
+    /// Runs work on the vectors of a question and its negatives, in the current generation's space.
     pub(super) fn asked<T>(
         &self,
         text: &str,
@@ -161,7 +158,7 @@ impl Viewer {
         })
     }
 
-    /// Returns what is asked in place of texts with words that the model does not know.
+    /// Replacements for texts with words that the model does not know.
     pub(super) fn asked_as(&self, texts: &[String]) -> Result<BTreeMap<String, String>, ViewError> {
         self.with_text_encoder(|_, OpenedText { encoder, .. }| {
             let known = encoder.known_phrases();
@@ -170,7 +167,7 @@ impl Viewer {
         })
     }
 
-    /// Returns what the things of the current generation are called, as the robot does.
+    /// Names of the current generation's things, as on the robot.
     pub(super) fn words(&self) -> Result<Words, ViewError> {
         self.with_text_encoder(|generation, opened| {
             let manifest = generation.reader.manifest();
@@ -183,7 +180,6 @@ impl Viewer {
         })
     }
 
-    /// Runs work with the current generation's text encoder.
     fn with_text_encoder<T>(
         &self,
         work: impl FnOnce(&Generation, &mut OpenedText) -> Result<T, ViewError>,
@@ -219,8 +215,7 @@ fn photo(view: &View) -> Photo {
     }
 }
 
-/// Returns the direction that is up in most photos: the mean of the cameras' upward axes; nothing if these cancel
-/// out.
+/// Mean of the photos' upward axes; `None` if these cancel out.
 pub(crate) fn up_of(views: &[View]) -> Option<Vec3> {
     let up = |view: &View| view.camera_from_world.inverse().transform_vector3(DVec3::NEG_Y).normalize();
     let sum: DVec3 = views.iter().map(up).sum();
@@ -235,7 +230,7 @@ mod tests {
     use super::*;
     use crate::store;
 
-    /// A camera at (1, 2, 3) that looks along the world's y, with the world's z upward.
+    /// A camera at (1, 2, 3) that looks along the world's y, with z upward.
     fn level() -> View {
         let world_from_camera = DAffine3 {
             matrix3: DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y),
@@ -249,7 +244,7 @@ mod tests {
         }
     }
 
-    /// What no request can be answered from is refused before there is an address.
+    /// A store that can answer no request is refused before there is an address.
     #[test]
     fn a_store_that_is_not_there_or_of_another_splat_is_refused() {
         let dir = tempfile::tempdir().expect("a folder");

@@ -11,20 +11,20 @@ use super::space::{Space, VOXEL, WIDTH};
 /// Most candidates; each costs a small drawing.
 pub(super) const MOST: usize = 600;
 const N_HEADINGS: usize = 8;
-/// Heights of cameras in a room and how far they look down: height in parts of the room's, radians.
+/// Heights of cameras in a room, as shares of its height, and how far they look down, radians.
 const INDOOR: [(f64, f64); 2] = [(0.4, 0.05), (0.6, 0.25)];
-/// Free distance around a camera in a room, in parts of its height.
+/// Free distance around a camera, as a share of the room's height.
 const CLEARANCE: f64 = 0.12;
-/// Heights of cameras above the ground, in parts of the scene's width, and how far they look down, radians.
+/// Heights of cameras above the ground, as shares of the scene's width, and how far they look down, radians.
 const OUTDOOR: [(f64, f64); 3] = [(0.05, 0.1), (0.1, 0.3), (0.2, 0.6)];
-/// Rings around an object: elevation, radians, and distance in parts of the one from which it fills the image.
+/// Rings around an object: elevation, radians, and distance as a share of the one at which it fills the image.
 const RINGS: [(f64, f64); 5] = [(0.1, 1.0), (0.1, 0.6), (0.45, 1.0), (0.45, 0.6), (0.95, 1.0)];
 const N_AROUND: usize = 24;
-/// Share of the columns with ground that have, above a gap, something overhead, from which a scene is indoor. A yard
-/// has 11 %, a drone scene 23 %.
+/// Least share, of the columns with ground, that have something overhead above a gap in an indoor scene. A yard has 11
+/// %, a drone scene 23 %.
 const MIN_OVERHEAD: f64 = 0.5;
 
-/// Returns whether something is overhead, as in rooms.
+/// Rooms have something overhead.
 pub(super) fn kind_of(space: &Space) -> SceneKind {
     let ground = 0.6 * space.half.z - space.half.z;
     let gap = 0.8 * space.half.z;
@@ -48,7 +48,7 @@ pub(super) fn of(kind: SceneKind, space: &Space) -> Vec<DAffine3> {
     }
 }
 
-/// Returns cameras with all headings at the places of the finest lattice that has few enough.
+/// Cameras with all headings at the places of the finest lattice that has few enough.
 fn standing(
     space: &Space,
     n_heights: usize,
@@ -74,7 +74,7 @@ fn standing(
     headings.collect()
 }
 
-/// Returns free places between floor and ceiling, with how far cameras look down there.
+/// Free places between floor and ceiling, with how far cameras look down.
 fn indoor_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
     let height = 2.0 * space.half.z;
     let places =
@@ -87,7 +87,7 @@ fn indoor_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
     places.filter(|(at, _)| is_in_room(*at) && space.is_clear(*at, (CLEARANCE * height).max(VOXEL))).collect()
 }
 
-/// Returns free places above the ground, with how far cameras look down there.
+/// Free places above the ground, with how far cameras look down.
 fn outdoor_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
     let Some(ground) = space.column(x, y).next() else { return Vec::new() };
     let places =
@@ -96,7 +96,7 @@ fn outdoor_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
     clear.map(|(at, down, _)| (at, down)).collect()
 }
 
-/// Returns cameras around an object that look at its middle, and at its upper and lower part from near.
+/// Cameras around an object that look at its middle and, from near, at its upper and lower part.
 fn rings(space: &Space) -> Vec<DAffine3> {
     let fills = space.half.length() / (PI / 8.0).sin();
     let around = RINGS.into_iter().flat_map(|(elevation, part)| {

@@ -20,9 +20,9 @@ use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer};
 pub const POSES_FILE: &str = "transforms.json";
 /// Size of drawings, pixels: that of the photos that the segmenter learnt on, enlarged little.
 const SIZE_PX: [u32; 2] = [800, 600];
-/// What shows through holes: grey is no thing's outline.
+/// Shows through holes: grey is no thing's outline.
 const BACKGROUND: [f32; 3] = [0.5; 3];
-/// Distance of the pixels among whose colours a sharpened pixel's remains.
+/// Distance of the pixels that bound a sharpened pixel's colour.
 const REACH_PX: i64 = 3;
 
 #[derive(Debug, thiserror::Error)]
@@ -39,7 +39,7 @@ pub enum DrawError {
     Drawn { path: PathBuf, fault: PhotoError },
 }
 
-/// A view to draw, with its file's name below `images/`.
+/// A view to draw, with its file name below `images/`.
 #[derive(Clone, Debug)]
 pub struct DrawnView {
     pub name: String,
@@ -48,7 +48,7 @@ pub struct DrawnView {
     pub about: Value,
 }
 
-/// Returns the views of a plan; their names are in the plan's order.
+/// Views of a plan, named in its order.
 pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
     let [width_px, height_px] = SIZE_PX;
     let intrinsics = pinhole(width_px, height_px);
@@ -115,8 +115,8 @@ impl Measured {
     }
 }
 
-/// Draws views as [`draw`] does, sharpened by how much they blur as the Gaussians grow: where those are small, little
-/// changes. `about`: further members of the poses file.
+/// As [`draw`], sharpened by how much views blur as the Gaussians grow; small Gaussians change little. `about`: further
+/// members of the poses file.
 pub fn draw_sharpened(
     folder: &Path,
     views: &[DrawnView],
@@ -145,7 +145,7 @@ fn read(path: &Path) -> Result<RgbImage, DrawError> {
     read.map_err(|fault| DrawError::Drawn { path: path.to_owned(), fault })
 }
 
-/// Writes the drawing of each view as `finish` makes it, which gets the file that it replaces.
+/// Writes each view's drawing as `finish` makes it, which gets the file to replace.
 fn draw_images(
     folder: &Path,
     views: &[DrawnView],
@@ -170,9 +170,8 @@ fn draw_images(
     Ok(())
 }
 
-/// Returns a drawing as Gaussians without extent would make it, nearly: blur grows with the square of their size, so
-/// what twice that square adds is taken away once (Richardson 1911). No colour is one that is not near: edges get no
-/// halos.
+/// Approximates a drawing of Gaussians without extent: blur grows with their squared size, so what twice the square
+/// adds is subtracted once (Richardson 1911). Colours stay within those nearby, so edges get no halos.
 fn sharpened(drawn: &RgbImage, blurred: &RgbImage) -> RgbImage {
     let [low, high] = [u8::min, u8::max].map(|of| extreme(drawn, of));
     let mut sharp = drawn.clone();
@@ -185,7 +184,7 @@ fn sharpened(drawn: &RgbImage, blurred: &RgbImage) -> RgbImage {
     sharp
 }
 
-/// Returns the least or greatest of each colour around each pixel.
+/// Least or greatest of each colour around each pixel.
 fn extreme(image: &RgbImage, of: fn(u8, u8) -> u8) -> RgbImage {
     let along = |from: &RgbImage, [dx, dy]: [i64; 2]| {
         let (width, height) = from.dimensions();
@@ -205,7 +204,7 @@ fn write_poses(folder: &Path, views: &[DrawnView], drawn_from: &str, about: Valu
     Ok(durable::write(&folder.join(POSES_FILE), &text)?)
 }
 
-/// Returns nerfstudio's `transforms.json` of views: world from camera, OpenGL axes.
+/// Nerfstudio's `transforms.json`: world from camera, OpenGL axes.
 fn poses(views: &[DrawnView], drawn_from: &str, about: Value) -> Value {
     let frame = |view: &DrawnView| {
         let mut frame = json!({
@@ -254,7 +253,7 @@ mod tests {
     use super::*;
     use slag_math::random::Random;
 
-    /// Oracle: the blurred edges of Gaussians of one size, and of twice its square, in closed form.
+    /// Oracle: blurred edges of Gaussians of one size, and of twice its square, in closed form.
     #[test]
     fn edges_are_sharpened_without_halos() {
         let sigma_px = 2.0;

@@ -9,32 +9,32 @@ use crate::masks::RegionMap;
 use crate::raster::{self, LoadedScene, RasterError, RasterView, RegionWeight};
 
 const SIZE_PX: [u32; 2] = [40, 30];
-/// Tangent of half the horizontal field of view, 60 degrees: that of a phone's main camera.
+/// Tangent of half the horizontal field of view, 60 degrees, as of a phone's main camera.
 const HALF_WIDTH: f64 = 0.577_350_269;
-/// Opacity below which a pixel is a hole.
+/// A pixel of lower opacity is a hole.
 const MIN_COVERED: f64 = 0.5;
-/// Difference of expected and median depth, relative to the latter, from which a pixel is hazy.
+/// Relative difference of expected and median depth from which a pixel is hazy.
 const HAZY: f64 = 0.15;
-/// Depth below which a pixel is near.
+/// A pixel of lower depth is near.
 const NEAR: f64 = 0.035 * WIDTH;
-/// Standard deviation on the screen from which a Gaussian is large: 24 px of a photo 640 px wide.
+/// Standard deviation on the screen of a large Gaussian: 24 px of a photo 640 px wide.
 const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
-/// Weight of a Gaussian that is seen, pixels of the drawing.
+/// Least weight of a seen Gaussian, pixels of the drawing.
 const MIN_WEIGHT: f32 = 0.02;
 /// Sides from which a Gaussian can be seen, around the vertical.
 const N_SIDES: usize = 8;
-/// Bytes of what a candidate shows: eight a Gaussian, about three Gaussians a pixel.
+/// Bytes of a look: eight per Gaussian, about three Gaussians per pixel.
 pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
 
 pub(super) struct Look {
-    /// Camera from the planner's axes.
+    /// From the planner's axes.
     pub(super) camera: DAffine3,
     pub(super) verdict: Verdict,
-    /// Gaussians that are seen, and from which side.
+    /// Gaussians, and the side from which they are seen.
     pub(super) seen: Vec<(u32, u8)>,
 }
 
-/// Returns the camera at a place that looks along a direction, upright.
+/// An upright camera at a place that looks along a direction.
 pub(super) fn look_along(eye: DVec3, direction: DVec3) -> DAffine3 {
     let forward = direction.normalize();
     let right = forward.cross(DVec3::Z).try_normalize().unwrap_or(DVec3::X);
@@ -46,12 +46,11 @@ pub(super) fn look_at(eye: DVec3, target: DVec3) -> DAffine3 {
     look_along(eye, target - eye)
 }
 
-/// Returns an ideal camera with the planner's field of view.
 pub(super) fn pinhole(width_px: u32, height_px: u32) -> Intrinsics {
     raster::pinhole([width_px, height_px], 0.5 * f64::from(width_px) / HALF_WIDTH)
 }
 
-/// Draws the weight of each Gaussian at each pixel, and judges it.
+/// Draws each Gaussian's weight at each pixel, and judges the view.
 pub(super) fn look(
     loaded: &dyn LoadedScene,
     space: &Space,
@@ -67,7 +66,7 @@ pub(super) fn look(
     let eye = camera.inverse().translation;
     let (mut large, mut total) = (0.0, 0.0);
     let mut seen = Vec::new();
-    // Each Gaussian with its depth, from near to far.
+    // Gaussians with their depths, from near to far.
     let mut layers = Vec::new();
     // Weight of each pixel, and its weighted depth.
     let mut sums = vec![(0.0, 0.0); n_px as usize];
@@ -107,8 +106,8 @@ pub(super) fn look(
     Ok(Look { camera, verdict, seen })
 }
 
-/// Counts the pixels that are no holes, and those of them that are near or hazy, by their median depth. `layers`: the
-/// Gaussians from near to far, each with its depth; `sums`: the weight of each pixel, and its weighted depth.
+/// Counts pixels that are no holes, and of those the near and the hazy ones, by median depth. `layers`: Gaussians from
+/// near to far with their depths; `sums`: weight of each pixel, and its weighted depth.
 fn count_pixels(layers: &[(f64, &[RegionWeight])], sums: &[(f64, f64)], near: f64) -> [u32; 3] {
     let [mut n_covered, mut n_near, mut n_hazy] = [0; 3];
     let mut nearer = vec![0.0; sums.len()];
@@ -128,7 +127,7 @@ fn count_pixels(layers: &[(f64, &[RegionWeight])], sums: &[(f64, f64)], near: f6
     [n_covered, n_near, n_hazy]
 }
 
-/// Returns the side from which a Gaussian is seen, by the direction to the camera.
+/// Side from which a Gaussian is seen, by the direction to the camera.
 fn side(towards: DVec3) -> u8 {
     let turns = towards.y.atan2(towards.x) / std::f64::consts::TAU + 0.5;
     ((turns * N_SIDES as f64) as u8).min(N_SIDES as u8 - 1)

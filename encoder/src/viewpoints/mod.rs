@@ -25,26 +25,26 @@ pub use draw::{POSES_FILE, draw, draw_sharpened};
 pub(crate) use plan::{Fault, Viewpoint};
 pub use plan::{SceneKind, Verdict, ViewpointError, ViewpointPlan, ViewpointSettings};
 
-/// Views where nothing else is asked for: more find no more (twice as many gain 1 % of average precision).
+/// Default number of views: twice as many gain 1 % of average precision.
 pub const DEFAULT_N_VIEWS: usize = 48;
-/// Fewer good candidates than this cannot show a scene from several sides.
+/// Fewer good candidates cannot show a scene from several sides.
 const MIN_GOOD: usize = 12;
-/// Gaussians that suffice for a plan, enlarged; small scenes lose by it: a quarter of a yard's 147,000 looks hazy from
-/// 150 places, all of them from 24.
+/// Gaussians that suffice for a plan, if enlarged. Small scenes lose by that: a quarter of a yard's 147,000 looks hazy
+/// from 150 places, all of them from 24.
 const ENOUGH_GAUSSIANS: usize = 1 << 18;
 const MAX_STRIDE: usize = 4;
-/// Height of a thing, in parts of its width, from which it is looked at from around: a robot on a piece of ground has
-/// 45 %, yards and drone scenes have 4 to 13 %.
+/// Least height of a thing, as a share of its width, that is looked at from around: a robot on a piece of ground has 45
+/// %, yards and drone scenes have 4 to 13 %.
 const TALL: f64 = 0.25;
 
 /// Gain of a Gaussian's first, second, third and further view, tenths.
 const GAINS: [u32; 4] = [10, 6, 4, 1];
-/// Gain from a side that no view has shown yet, and from one that a view has shown, fifths.
+/// Gain of a side that no view has shown yet, and of one that a view has shown, fifths.
 const NEW_SIDE: u32 = 5;
 const USED_SIDE: u32 = 2;
 
-/// Plans the views of a scene within `memory_bytes`, the scene's included. The plan does not depend on the number of
-/// threads, nor on the scene's scale.
+/// Plans a scene's views within `memory_bytes`, including the scene. The plan depends neither on threads nor on the
+/// scene's scale.
 ///
 /// # Errors
 /// [`ViewpointError`] where views cannot be trusted; it says what to give.
@@ -56,7 +56,7 @@ pub fn plan(
     cancel: &AtomicBool,
 ) -> Result<ViewpointPlan, ViewpointError> {
     let stride = (scene.len() / ENOUGH_GAUSSIANS).clamp(1, MAX_STRIDE);
-    // A column each of means, rotations, scales, opacities and colours, and what candidates show.
+    // Columns of means, rotations, scales, opacities and colours, and the candidates' looks.
     let mut memory = MemoryPlan::new(memory_bytes);
     memory.reserve(Phase::Always, "the scene with its colours", scene.len_bytes());
     let thin_bytes = Gaussians::decoded_bytes(scene.len() / stride, 0) as u64;
@@ -129,8 +129,8 @@ fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
     looked.iter().filter(|look| look.verdict.fault(kind) == fault).count()
 }
 
-/// Returns whether a scene is a thing with nothing around it: from within, one looks past it, and it is tall, or
-/// there is no other way to look at it.
+/// Whether a scene is a thing with nothing around it: from within, one looks past it, and it is tall, or there is no
+/// other way to look at it.
 fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
     let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
     2 * n_with(looked, kind, Some(Fault::Holes)) > looked.len()
@@ -143,8 +143,8 @@ fn faults(bad: &[Look], kind: SceneKind) -> String {
     told.collect::<Vec<_>>().join(", ")
 }
 
-/// Returns whether the scene seen from above has more of large Gaussians than from below: what no photo has seen, as
-/// the underside of the ground, nothing makes small.
+/// Whether large Gaussians cover more from above than from below: nothing makes Gaussians small that no photo has seen,
+/// such as the underside of the ground.
 fn large_from_above(space: &Space, rasterizer: &dyn Rasterizer) -> Result<bool, RasterError> {
     let loaded = rasterizer.load(&space.scene)?;
     let large = |sign: f64| {
@@ -155,7 +155,6 @@ fn large_from_above(space: &Space, rasterizer: &dyn Rasterizer) -> Result<bool, 
     Ok(large(1.0)? > large(-1.0)?)
 }
 
-/// How often a Gaussian is seen, and from which sides.
 #[derive(Clone, Copy, Default)]
 struct Seen {
     n_views: u8,
@@ -169,15 +168,14 @@ impl Seen {
     }
 }
 
-/// Returns at most `n_views` looks, each the one that gains most after those before it, and the share of the Gaussians
-/// seen by any look that they see. Ties go to the first. Gains only fall, so most need not be computed again (Minoux
-/// 1978).
+/// Picks at most `n_views` looks greedily by gain; also returns the share they see of the Gaussians in any look. Ties
+/// go to the first. Gains only fall, so most need not be computed again (Minoux 1978).
 fn greedy(looks: &[Look], n_gaussians: usize, n_views: usize) -> (Vec<usize>, f64) {
     let mut state = vec![Seen::default(); n_gaussians];
     let gain = |state: &[Seen], look: &Look| -> u64 {
         look.seen.iter().map(|(gaussian, side)| u64::from(state[*gaussian as usize].gain(*side))).sum()
     };
-    // (gain, first look, how many were chosen when the gain was computed)
+    // (gain, first look, number of chosen looks when the gain was computed)
     let mut heap: BinaryHeap<_> =
         looks.iter().enumerate().map(|(at, look)| (gain(&state, look), Reverse(at), 0)).collect();
     let mut chosen = Vec::new();

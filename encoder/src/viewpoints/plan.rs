@@ -8,7 +8,7 @@ use serde::Serialize;
 use crate::memory::MemoryError;
 use crate::raster::RasterError;
 
-/// Most of each that a view may have, 0 to 1.
+/// Largest shares in a view, 0 to 1.
 const MAX_HOLES: f32 = 0.1;
 const MAX_NEAR: f32 = 0.2;
 const MAX_HAZE: f32 = 0.15;
@@ -118,7 +118,6 @@ pub struct Verdict {
     pub large: f32,
 }
 
-/// Why a view cannot be trusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     Holes,
@@ -143,7 +142,7 @@ impl fmt::Display for Fault {
 }
 
 impl Verdict {
-    /// Returns why a view is not to be used; `None` if it is good.
+    /// `None` if the view is good.
     pub fn fault(&self, kind: SceneKind) -> Option<Fault> {
         let holes = if kind == SceneKind::Object { MAX_HOLES_OF_OBJECT } else { MAX_HOLES };
         let limits = [

@@ -11,18 +11,18 @@ use crate::ground::up::{self, TRIMMED};
 pub(super) const WIDTH: f64 = 10.0;
 pub(super) const VOXEL: f64 = WIDTH / 160.0;
 const MARGIN: f64 = 4.0;
-/// Larger ones are sky or fog, which occupy nothing.
+/// Larger Gaussians are sky or fog, which occupy nothing.
 const MAX_SCALE: f32 = 0.1 * WIDTH as f32;
-/// Standard deviations of a Gaussian that it occupies.
+/// Reach of a Gaussian in standard deviations.
 const REACH: f64 = 1.5;
 const MIN_GAUSSIANS: usize = 100;
 
 pub(super) struct Space {
-    /// In the planner's axes: z up, x along the longest horizontal side, the middle of the scene at the origin.
+    /// Axes: z up, x along the longest horizontal side, the scene's middle at the origin.
     pub(super) scene: Gaussians,
-    /// By how much Gaussians are enlarged.
+    /// Factor by which Gaussians are enlarged.
     pub(super) grown: f32,
-    /// Half the size of the scene without strays.
+    /// Half the size without strays.
     pub(super) half: DVec3,
     plan_from_world: DMat3,
     centre_in_world: DVec3,
@@ -32,10 +32,10 @@ pub(super) struct Space {
     occupied: Vec<bool>,
 }
 
-/// Some of a scene's Gaussians, enlarged so that surfaces stay closed, without colours.
+/// Some of a scene's Gaussians, without colours, enlarged so that surfaces stay closed.
 pub(super) struct Thinned {
     pub(super) scene: Gaussians,
-    /// By how much Gaussians are enlarged.
+    /// Factor by which Gaussians are enlarged.
     grown: f32,
 }
 
@@ -58,7 +58,7 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Result<Thinned, Viewp
 }
 
 impl Space {
-    /// Brings a scene into the planner's axes, and finds its occupied voxels.
+    /// Converts a scene to the planner's axes, and finds its occupied voxels.
     pub(super) fn new(thin: &Thinned, up: DVec3) -> Self {
         let Thinned { scene: world, grown } = thin;
         let x_axis = longest_side(world, up);
@@ -131,7 +131,6 @@ impl Space {
         occupied
     }
 
-    /// Returns the number of the voxel at a point; `None` outside of the grid.
     fn voxel(&self, at: DVec3) -> Option<usize> {
         let [x, y, z] = ((at + self.half) / VOXEL + MARGIN).to_array().map(f64::floor);
         let [nx, ny, nz] = self.n;
@@ -144,7 +143,7 @@ impl Space {
         self.voxel(at).is_some_and(|voxel| self.occupied[voxel])
     }
 
-    /// Returns whether nothing is within a distance of a point.
+    /// Whether nothing lies within a distance of a point.
     pub(super) fn is_clear(&self, at: DVec3, distance: f64) -> bool {
         let n = (distance / VOXEL).ceil() as i32;
         let mut around = (-n..=n).flat_map(|x| (-n..=n).flat_map(move |y| (-n..=n).map(move |z| [x, y, z])));
@@ -154,14 +153,14 @@ impl Space {
         })
     }
 
-    /// Returns the heights of occupied voxels in the column at a point, from below.
+    /// Heights of occupied voxels in the column at a point, ascending.
     pub(super) fn column(&self, x: f64, y: f64) -> impl DoubleEndedIterator<Item = f64> + '_ {
         let n = (2.0 * self.half.z / VOXEL) as i32 + MARGIN as i32;
         let heights = (-(MARGIN as i32)..n).map(move |k| -self.half.z + (f64::from(k) + 0.5) * VOXEL);
         heights.filter(move |z| self.is_occupied(DVec3::new(x, y, *z)))
     }
 
-    /// Returns the points of a square lattice over the scene's plan, `step` apart.
+    /// Square lattice over the scene's plan, `step` apart.
     pub(super) fn lattice(&self, step: f64) -> impl Iterator<Item = (f64, f64)> + use<> {
         let along = move |half: f64| {
             let n = (half / step) as i32;
@@ -172,7 +171,7 @@ impl Space {
     }
 }
 
-/// Returns the horizontal direction along which a scene extends most, with a sign that its Gaussians decide.
+/// Horizontal direction of largest extent, with a sign that the Gaussians decide.
 fn longest_side(scene: &Gaussians, up: DVec3) -> DVec3 {
     let a = up.any_orthonormal_vector();
     let b = up.cross(a);

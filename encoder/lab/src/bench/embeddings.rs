@@ -8,7 +8,6 @@ use slag_encoder::codebook::TextBank;
 use slag_math::random::mix64;
 
 const CELL: usize = 62_500;
-/// Kinds of things; each has a text.
 const KINDS: usize = 400;
 const THING: usize = 1_250;
 const VIEWS: usize = 6;
@@ -58,7 +57,7 @@ fn make_unit(vector: &mut [f32]) {
 }
 
 impl Field {
-    /// Makes a field of `n_gaussians`, rounded down to whole cells (at least one).
+    /// Makes a field; `n_gaussians` is rounded down to whole cells (at least one).
     pub fn new(n_gaussians: usize, dim: usize) -> Self {
         let mut kinds = vec![0.0; KINDS * dim];
         let mut common = vec![0.0; dim];
@@ -129,7 +128,7 @@ impl Field {
     }
 }
 
-/// Returns the place of a cell's k-th Gaussian in a cube of 20 m, on a grid of 0.5 m.
+/// Places a cell's k-th Gaussian in a cube of 20 m, on a grid of 0.5 m.
 pub fn place_in_cube(k: u64) -> DVec3 {
     // 41^3 places are more than a cell's Gaussians. Things are runs of k, so they stay together.
     DVec3::new((k / (41 * 41)) as f64, (k / 41 % 41) as f64, (k % 41) as f64) * 0.5

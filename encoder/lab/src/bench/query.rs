@@ -24,7 +24,6 @@ const N_WARM_UP: usize = 5;
 /// Weight of a scene's embedding in a query that resembles a text: text and image vectors of one thing have
 /// cosines around this (CLIP).
 const LIKENESS: f64 = 0.3;
-/// Gaussians that a dump decodes at a time.
 const CHUNK: usize = 4096;
 
 #[derive(Debug, Args)]
@@ -121,7 +120,6 @@ pub(crate) fn run(args: &QueryArgs) -> Result<QueryReport> {
 /// Times both kinds of answers, with buffers that a process keeps between queries.
 fn time(shards: &[ShardView<'_>], questions: &[Question], limit: usize, args: &QueryArgs) -> Result<Timing> {
     let mut scratch = Scratch::default();
-    // An answer has positions.
     let position = |shard: u32, index: u32| shards[shard as usize].position_in_world(index as usize);
     let n_runs = args.runs as usize;
     let question = |turn: usize| &questions[turn % questions.len()];

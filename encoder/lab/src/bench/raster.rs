@@ -118,8 +118,7 @@ fn grid_regions(width_px: u32, height_px: u32) -> RegionMap {
     RegionMap { width_px, height_px, region_of_pixel, n_regions: columns * rows }
 }
 
-/// Measures all devices on a scene. They take turns view by view, so that other load on the machine affects all of
-/// them alike.
+/// Measures all devices on a scene; they take turns view by view, so that other load affects all alike.
 fn measure(
     scene: &BenchScene,
     devices: &[Device],

@@ -83,7 +83,7 @@ impl FromStr for Engine {
 }
 
 impl Engine {
-    /// Returns the profile whose shards `slag-edge` queries; `None` for other engines.
+    /// The profile whose shards `slag-edge` queries; `None` for other engines.
     fn profile(&self) -> Option<Profile> {
         Profile::ALL.into_iter().find(|profile| profile.name() == self.name)
     }
@@ -99,7 +99,7 @@ impl Engine {
         }
     }
 
-    /// Returns why it cannot or shall not be measured at a size.
+    /// The reason not to measure it at a size, if there is one.
     fn reason_against(&self, args: &RobotArgs, free: Option<u64>, n_gaussians: u64) -> Option<String> {
         if let Some(most) = self.most_gaussians.filter(|most| n_gaussians > *most) {
             return Some(format!("asked for up to {most} Gaussians"));
@@ -283,7 +283,7 @@ impl<'a> Scene<'a> {
 
     /// Reads times as both programs print them, and judges the ids that they wrote.
     fn search(&self, printed: &Value, name: &str, ids: &Path) -> Result<SearchFigures> {
-        // Ours times two kinds of answers.
+        // `slag-edge` times two kinds of answers.
         let times = if printed["best"].is_object() { &printed["best"] } else { printed };
         let of = |value: &Value, key: &str| {
             let missing = || format!("{name}: no {key} in its JSON; build it from this version");
@@ -365,7 +365,6 @@ const BLOCK: usize = 1 << 14;
 /// Scores this close to the last of the best count as ties: the products of others are of f32.
 const TIE: f64 = 1e-6;
 
-/// The scores of all vectors for some queries.
 pub(super) struct Truth {
     /// `[n_queries][n]`.
     scores: Vec<Vec<f64>>,
@@ -408,7 +407,7 @@ impl Truth {
         Ok((!recalls.is_empty()).then(|| recalls.iter().sum::<f64>() / recalls.len() as f64))
     }
 
-    /// Returns the share of a query's best `limit` vectors that was found; `None` for a query without scores.
+    /// Share found of a query's best `limit` vectors; `None` for a query without scores.
     fn recall(&self, query: usize, limit: usize, mut found: Vec<u32>) -> Option<f64> {
         let scores = self.scores.get(query).filter(|scores| !scores.is_empty())?;
         let limit = limit.min(scores.len());
@@ -448,7 +447,7 @@ mod tests {
         }
     }
 
-    /// What an earlier run measured is not measured again, and an engine without its program or memory is named.
+    /// A second run measures nothing again; an engine without its program or memory is named.
     #[test]
     fn what_cannot_run_is_named() {
         let dir = tempfile::tempdir().expect("a folder");

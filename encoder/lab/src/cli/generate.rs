@@ -128,7 +128,6 @@ fn scene(args: &SceneArgs, progress: &dyn Progress) -> Result<()> {
     Ok(())
 }
 
-/// Prints the command that encodes what was generated.
 fn next(scene: &Path, views: &Path, flags: &str) {
     let (scene, views) = (scene.display(), views.display());
     println!("next: slag-encoder encode --scene {scene} --views {views} {flags}--store STORE");

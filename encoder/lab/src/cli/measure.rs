@@ -73,7 +73,7 @@ pub(super) fn eval(command: &EvalCommand, progress: &dyn Progress, json: bool) -
     }
 }
 
-/// Prints a result; returns whether anything was left out of it.
+/// Prints a result; the exit code says whether it is complete.
 fn show(json: bool, result: &(impl Serialize + Display), is_complete: bool) -> Result<Exit> {
     print(json, result, result)?;
     Ok(if is_complete { Exit::Done } else { Exit::Partly })

@@ -27,7 +27,7 @@ use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
 const KINDS: [SceneKind; 2] = [SceneKind::Room, SceneKind::Yard];
-/// Photos of both together.
+/// Photos of room and yard together.
 const N_VIEWS: u32 = 72;
 /// The photo in the yard that was taken where the robot stands.
 const ROBOT_VIEW: usize = 1;
@@ -84,7 +84,7 @@ impl DemoReport {
         self.questions.iter().all(|q| q.right)
     }
 
-    /// Returns the link that opens the robot's page with the first question, if the page is in the programs.
+    /// Link to the robot's page with the first question; `None` for programs built without the page.
     fn link(&self) -> Option<String> {
         let question = self.questions.first().filter(|_| slag_view::is_built())?;
         Some(format!("http://127.0.0.1:7734/view#q={}", question.text.replace(' ', "+")))
@@ -149,9 +149,8 @@ fn encode(
     settings.output.created_unix_secs = options.created_unix_secs;
     settings.run.memory_bytes = 1 << 30;
     settings.run.strict = true;
-    // The page then shows colours on the robot, too.
+    // So that the robot's page shows colours, too.
     settings.cells.shards.compact_appearance = true;
-    // Small cells, so that the demo has several.
     settings.cells.limits = CellLimits { max_gaussians: 16_384, ..settings.cells.limits };
     let engines = Engines::new(models, &options.session, &CpuRasterizer);
     encode::encode(&settings, &engines, progress, cancel).context("encode")

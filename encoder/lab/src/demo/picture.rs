@@ -15,7 +15,7 @@ const COLUMNS: usize = 4;
 
 const BACKGROUND: [f32; 3] = [0.9; 3];
 
-/// Draws a scene with the Gaussians of `cosines` (`[N]`) at or above the threshold lit, at the view's own size.
+/// Draws the Gaussians at or above the threshold lit, at the view's own size. `cosines`: `[N]`.
 fn draw_lit(
     scene: &Gaussians,
     cosines: &[f32],
@@ -37,13 +37,12 @@ fn draw_lit(
     Ok(CpuRasterizer.draw(&coloured, view, BACKGROUND)?.image())
 }
 
-/// Returns the brightness of a colour (BT.601).
+/// Brightness of a colour (BT.601).
 fn luma([r, g, b]: [f32; 3]) -> f32 {
     0.299 * r + 0.587 * g + 0.114 * b
 }
 
 pub(super) struct Panel<'a> {
-    /// The question, written across the top.
     pub(super) question: &'a str,
     pub(super) answer: &'a EdgeAnswer,
     /// Cosine of each Gaussian with the question; NaN where it has no embedding.
@@ -79,7 +78,7 @@ pub(super) fn answers(
     Ok(picture)
 }
 
-/// Returns the view that shows the most matching pixels, of the views with the answer nearest to their middle.
+/// Of the views with the answer nearest to their middle, returns the one with the most matching pixels.
 fn best_view(scene: &Gaussians, views: &[RasterView], panel: &Panel<'_>) -> Result<RasterView, RasterError> {
     let off_axis = |view: &RasterView| {
         let in_camera = view.camera_from_world.transform_point3(panel.answer.position_in_world);
@@ -156,7 +155,6 @@ pub(super) fn map(
     map.image
 }
 
-/// A picture from above, north up.
 struct Map {
     image: RgbImage,
     /// The corner of the cells at the bottom left.

@@ -10,12 +10,12 @@ const ABSENT: &str = "an elephant";
 
 pub(super) struct Asked<'a> {
     pub(super) text: String,
-    /// The things that it describes; empty if the correct answer is that nothing was found.
+    /// The things it describes; empty if nothing should be found.
     pub(super) truth: Vec<&'a TrueObject>,
 }
 
 struct Form {
-    /// Returns the question about a thing; `None` where the form does not fit the thing.
+    /// The question about a thing; `None` where the form does not fit the thing.
     text: fn(&TrueObject) -> Option<String>,
     /// Whether a question about the first thing also describes the second.
     is_true: fn(&TrueObject, &TrueObject) -> bool,
@@ -27,7 +27,6 @@ const FORMS: [Form; 7] = [
         text: |o| Some(format!("{} {}", o.colours.first()?, o.category)),
         is_true: |a, b| same_noun(a, b) && a.colours.first() == b.colours.first(),
     },
-    // A synonym.
     Form {
         text: |o| o.words.iter().find(|word| **word != o.category).map(|word| format!("the {word}")),
         is_true: same_noun,
@@ -60,7 +59,7 @@ fn adjective(material: &str) -> Option<&str> {
     }
 }
 
-/// Returns the plural of a noun that only takes an s.
+/// Plural of a noun that only takes an s.
 fn plural(noun: &str) -> Option<String> {
     (!noun.ends_with(['s', 'x', 'h', 'y', 'f'])).then(|| format!("{noun}s"))
 }

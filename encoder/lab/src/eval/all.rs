@@ -25,7 +25,7 @@ pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<AllRepor
     let scenes = args.scene.iter().map(|dir| dir.as_os_str());
     let of_masks: Vec<&OsStr> = [OsStr::new("--scene")].into_iter().chain(scenes).collect();
     let [of_relations, of_goal] = [&of_relations, &of_goal].map(|out| [OsStr::new("--out"), out.as_os_str()]);
-    // First what fails early.
+    // What fails early comes first.
     Ok(AllReport {
         masks: masks::run(&with_defaults(&of_masks)?, progress)?,
         defaults: defaults::run(args, progress)?,
@@ -34,7 +34,7 @@ pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<AllRepor
     })
 }
 
-/// Returns the arguments of a command as if only these flags were given.
+/// Returns a command's arguments with only these flags given.
 fn with_defaults<T: Args>(flags: &[&OsStr]) -> Result<T> {
     let command = T::augment_args(Command::new("all").no_binary_name(true));
     Ok(T::from_arg_matches(&command.try_get_matches_from(flags)?)?)

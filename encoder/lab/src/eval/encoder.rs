@@ -157,7 +157,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
     })
 }
 
-/// A crop's label, and its best noun, colour and material.
+/// A crop's label, and the nouns, colours and materials with the best scores.
 type Seen = (Label, usize, usize, usize);
 type IsIn = fn(&Label) -> bool;
 
@@ -192,7 +192,7 @@ fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
 }
 
 fn of_each_noun(seen: &[Seen], nouns: &[Noun]) -> Vec<NounReport> {
-    // The confusion matrix over whole things: answers by true noun.
+    // Confusion matrix over whole things: answers by true noun.
     let mut counts = vec![vec![0; nouns.len()]; nouns.len()];
     seen.iter().filter(|s| is_whole(&s.0)).for_each(|(label, noun, ..)| counts[label.noun][*noun] += 1);
     let report = |(i, counts): (usize, &Vec<usize>)| {

@@ -9,7 +9,7 @@ use super::truth::Truth;
 use crate::table::percent;
 use slag_encoder::objects::NONE;
 
-/// Share of an object or a thing that counts as a piece of it.
+/// Least overlap, as a share of the object or the thing, that counts as a piece.
 const PIECE: f64 = 0.25;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -74,8 +74,6 @@ impl fmt::Display for InstanceReport {
     }
 }
 
-/// Compares things with objects.
-///
 /// `object_of`: the object of each Gaussian; `classes`: words with the ids of their things; `scores`: by word and
 /// object.
 pub(super) fn report(

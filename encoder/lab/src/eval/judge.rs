@@ -193,13 +193,12 @@ pub(crate) fn judge(
     })
 }
 
-/// A category that the encoder knows, with its things and its scores.
 struct Class {
     word: String,
     ids: Vec<u16>,
     /// `[N]`; NaN without evidence.
     cosines: Vec<f32>,
-    /// Of objects, where those are scored.
+    /// By object; empty where objects are not scored.
     of_objects: Vec<f32>,
 }
 
@@ -212,9 +211,9 @@ struct Asker<'a> {
 }
 
 impl Asker<'_> {
-    /// Returns a word's scores of Gaussians and of objects; `None` for one that the encoder does not know.
+    /// Scores of Gaussians and of objects; `None` for a word unknown to the encoder.
     fn score(&mut self, word: &str) -> Result<Option<(Vec<f32>, Vec<f32>)>> {
-        // What another word finds says nothing of the model's own.
+        // A synonym's results say nothing about the word itself.
         let asked_as = self.encoder.known_phrases().and_then(|known| known.asked_as(word));
         let encoded = match asked_as {
             Some(other) => Err(format!("asked as {other}")),
@@ -254,7 +253,7 @@ impl Asker<'_> {
         }
     }
 
-    /// Returns how many absent categories find nothing, and how many were asked.
+    /// Returns the numbers of absent categories that find nothing and that were asked.
     fn abstained(&mut self, truth: &Truth, threshold: f32) -> Result<[usize; 2]> {
         let is_present = |word: &str| {
             let mut things = truth.things.iter().chain(&truth.background);
@@ -297,8 +296,7 @@ impl Thresholds {
     }
 }
 
-/// The Gaussians that are judged. Retrieval counts those of all things; argmax only those of the queried
-/// categories.
+/// The judged Gaussians: those of all things for retrieval, those of the queried categories for argmax.
 struct Things {
     /// The Gaussians of all things, with their class where it was asked for.
     gaussians: Vec<(usize, Option<usize>)>,

@@ -34,7 +34,6 @@ const MIN_COVERAGE: f32 = 0.7;
 /// Largest relative difference between the aspect ratios of a label and its view.
 const MAX_ASPECT_ERROR: f64 = 0.01;
 
-/// The threshold of the paper's figures.
 const PAPERS_THRESHOLD: f32 = 0.28;
 
 #[derive(Debug, Args)]
@@ -77,14 +76,14 @@ pub(crate) fn run(args: &LerfArgs) -> Result<LerfReport> {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct LabelledThing {
     pub(super) category: String,
-    /// Its pixels, row-major.
+    /// Row-major.
     pub(super) mask: Vec<bool>,
 }
 
 #[derive(Clone, Debug)]
 pub(super) struct LabelledFrame {
     pub(super) name: String,
-    /// The camera, at the label's size.
+    /// At the label's size.
     pub(super) view: RasterView,
     pub(super) things: Vec<LabelledThing>,
 }
@@ -195,8 +194,7 @@ impl LabelledFrame {
     }
 }
 
-/// Sets the pixels in or on a polygon by the even-odd rule; its corners are truncated to whole pixels, as in
-/// LangSplat.
+/// Sets the pixels in or on a polygon (even-odd rule); corners are truncated to whole pixels, as in LangSplat.
 fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
     let corners: Vec<[i64; 2]> = polygon.iter().map(|corner| corner.map(|v| v as i32 as i64)).collect();
     let edges: Vec<_> = corners.iter().zip(corners.iter().cycle().skip(1)).collect();
@@ -295,14 +293,13 @@ pub(super) fn judge(
 }
 
 impl LerfReport {
-    /// Returns for a threshold the mean IoU, and the shares of things with one above 0.25 and 0.5.
+    /// Mean IoU at a threshold, and the shares of things with an IoU above 0.25 and above 0.5.
     pub(super) fn means(&self, at: usize) -> [Option<f64>; 3] {
         let above =
             |least: f64| mean(self.things.iter().map(|t| Some(f64::from(u8::from(t.ious[at] > least)))));
         [mean(self.things.iter().map(|t| Some(t.ious[at]))), above(0.25), above(0.5)]
     }
 
-    /// Returns whether every word is known, and every frame has a pose.
     pub(crate) fn is_complete(&self) -> bool {
         self.unknown_words.is_empty() && self.frames_without_view.is_empty()
     }

@@ -1,7 +1,7 @@
 //! `eval locate`: photos that the map has not seen, located in it; photos of the other scenes must not be.
 //!
-//! The map is made of three quarters of a scene's photos. The rest, and the photos of `test/`, are the queries. One
-//! that is unsure counts as lost.
+//! Three quarters of a scene's photos make the map; the rest, and those of `test/`, are the queries. An unsure answer
+//! counts as lost.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -25,17 +25,17 @@ use super::truth::Truth;
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure};
 
-/// Of so many photos one is a query.
+/// One photo in this many is a query.
 const HELD_OUT: usize = 4;
-/// Foreign photos that are tried in a scene at most, evenly among all.
+/// Most foreign photos tried in a scene, evenly spread over all.
 const MAX_FOREIGN: usize = 48;
 const FOCAL_FACTOR: f64 = 1.03;
 const DARK_FACTOR: f32 = 0.4;
-/// Steps of a robot's positions where the scene is metric, metres.
+/// Step to which a robot's positions are rounded where the scene is metric, metres.
 const POSITION_STEP_M: f64 = 0.02;
 /// Width of the square of [`Change::Covered`], as a share of each side: 20 % of the area.
 const COVERED_SIDE: f64 = 0.447;
-/// Of so many things of [`Change::Moved`] one stands elsewhere, so many metres away.
+/// One thing in this many is moved, and by this many metres.
 const MOVED_THINGS: u16 = 3;
 const MOVED_M: f64 = 1.0;
 
@@ -73,7 +73,6 @@ enum Change {
 
 struct Located {
     name: String,
-    /// The scene as a robot has it.
     gaussians: Gaussians,
     map: Map,
     len_bytes: u64,
@@ -83,7 +82,7 @@ struct Located {
     drawn: Option<Gaussians>,
 }
 
-/// A query's result: errors in metres and degrees, where it was found.
+/// Errors in metres and degrees, or why the query was not found.
 struct Try {
     found: Result<[f64; 2], String>,
     secs: f64,
@@ -170,7 +169,7 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
 fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     let gaussians = splat::read(&files.splat, &ReadOptions { with_sh_rest: true })?;
     let views = poses::read(&files.poses, files.images.as_deref())?.views;
-    // The last of each.
+    // The last photo of each group.
     let is_query = |at: usize| at % HELD_OUT == HELD_OUT - 1;
     let start = Instant::now();
     let loaded = CpuRasterizer.load(&gaussians)?;
@@ -205,7 +204,7 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     })
 }
 
-/// Returns a scene with some of its things moved sideways, each its own way.
+/// Moves some of the things sideways, each its own way.
 fn moved(scene: &Gaussians, truth: &Truth) -> Gaussians {
     let mut moved = scene.clone();
     let is_thing = |id: u16| truth.things.iter().any(|thing| thing.id == id);
@@ -217,7 +216,7 @@ fn moved(scene: &Gaussians, truth: &Truth) -> Gaussians {
     moved
 }
 
-/// Returns a scene as a robot has it, without harmonics and rounded.
+/// Returns a scene as a robot holds it: rounded, without harmonics.
 fn on_board(scene: &Gaussians) -> Gaussians {
     let indices: Vec<u32> = (0..scene.len() as u32).collect();
     let columns = AppearanceColumns::of(scene, &indices);
@@ -228,14 +227,12 @@ fn on_board(scene: &Gaussians) -> Gaussians {
     on_board
 }
 
-/// A photo as the robot has it.
 struct Query {
     grey: Grey,
     intrinsics: Intrinsics,
     camera_from_world: glam::DAffine3,
 }
 
-/// Reads a query's photo, or draws it, and changes it.
 fn query(view: &View, change: Change, drawn: Option<&dyn LoadedScene>) -> Result<Query> {
     let loaded = ingest::load_image(view).with_context(|| view.name.clone())?;
     let mut intrinsics = loaded.view.intrinsics;

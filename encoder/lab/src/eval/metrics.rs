@@ -1,7 +1,6 @@
 //! Measures of agreement between answers and labels.
 
-/// Returns the area under the ROC curve, ties counted half (Mann and Whitney 1947); `None` without both positives
-/// and negatives.
+/// Area under the ROC curve, ties counted half (Mann and Whitney 1947); `None` without both classes.
 pub(super) fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     let n_negative = positive.len() as f64 - n_positive;
@@ -20,8 +19,8 @@ pub(super) fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     Some((sum - n_positive * (n_positive + 1.0) / 2.0) / (n_positive * n_negative))
 }
 
-/// Returns the average precision: the sum of precision over steps of recall, as in TREC and scikit-learn. Equal
-/// scores form one step. `None` without positives.
+/// Average precision: the sum of precision over steps of recall, as in TREC and scikit-learn. Equal scores form one
+/// step. `None` without positives.
 pub(super) fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     if n_positive == 0.0 {
@@ -45,7 +44,6 @@ fn descending(scores: &[f32]) -> Vec<usize> {
     order
 }
 
-/// A confusion matrix: answers by true class.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Confusion {
     n_classes: usize,
@@ -58,7 +56,7 @@ impl Confusion {
         Self { n_classes, counts: vec![0; n_classes * (n_classes + 1)] }
     }
 
-    /// Counts an answer; `None` is a wrong one.
+    /// Counts an answer; `None` is wrong for every class.
     pub(super) fn count(&mut self, truth: usize, answer: Option<usize>) {
         self.counts[truth * (self.n_classes + 1) + answer.unwrap_or(self.n_classes)] += 1;
     }
@@ -67,7 +65,7 @@ impl Confusion {
         &self.counts[truth * (self.n_classes + 1)..(truth + 1) * (self.n_classes + 1)]
     }
 
-    /// Returns the intersection over union of a class; `None` where it neither occurs nor is answered.
+    /// Intersection over union; `None` where the class neither occurs nor is answered.
     pub(super) fn iou(&self, class: usize) -> Option<f64> {
         let both = self.row(class)[class];
         let is_true: u64 = self.row(class).iter().sum();
@@ -76,7 +74,7 @@ impl Confusion {
         (union > 0).then(|| both as f64 / union as f64)
     }
 
-    /// Returns the share of a class that is answered correctly; `None` where the class does not occur.
+    /// Share answered correctly; `None` where the class does not occur.
     pub(super) fn accuracy(&self, class: usize) -> Option<f64> {
         let is_true: u64 = self.row(class).iter().sum();
         (is_true > 0).then(|| self.row(class)[class] as f64 / is_true as f64)

@@ -21,7 +21,7 @@ use super::run::truth_of;
 use super::truth::{Thing, Truth};
 use crate::table::{Table, figure, percent};
 
-/// Share of an object's Gaussians that its thing has.
+/// Least share of an object's Gaussians that its thing has.
 const SHARE: f64 = 0.5;
 /// Bins of the expected calibration error (Guo et al. 2017).
 const N_BINS: usize = 10;
@@ -58,9 +58,9 @@ pub(crate) struct NamesArgs {
 
 #[derive(Clone, Copy, Debug)]
 struct Named {
-    /// The best name's score.
+    /// Score of the best name.
     cosine: f32,
-    /// Confidences, best first, and whether they are right.
+    /// Confidences, best first, and whether each name is right.
     names: [(f32, bool); MAX_NAMES],
 }
 
@@ -175,8 +175,7 @@ impl Row {
     }
 }
 
-/// Returns the mean difference of confidence and share of right names, over bins of confidence, weighted by their
-/// names.
+/// Mean gap between confidence and share of right names, over bins of confidence weighted by their names.
 fn calibration_error(names: impl Iterator<Item = (f32, bool)>) -> f64 {
     let mut bins = [(0usize, 0.0, 0usize); N_BINS];
     for (confidence, is_right) in names {
@@ -233,7 +232,7 @@ mod tests {
         assert!(is_right("writing desk", &thing("table", &["writing desk"])));
     }
 
-    /// By hand: of two names said to be 0.9 sure one is right, one of 0.1 is right.
+    /// By hand: one of two names with confidence 0.9 is right, and so is one with 0.1.
     #[test]
     fn calibration_error_by_hand() {
         let names = [(0.9, true), (0.9, false), (0.1, true)];

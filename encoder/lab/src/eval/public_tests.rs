@@ -25,7 +25,6 @@ const COLUMNS: usize = 24;
 const ROWS: usize = 16;
 const PHOTO_PX: [u32; 2] = [320, 240];
 
-/// Returns the places of the Gaussians, row by row.
 fn on_wall() -> impl Iterator<Item = (f64, f64)> {
     (0..COLUMNS * ROWS).map(|i| ((i % COLUMNS) as f64 * 0.1 - 1.15, (i / COLUMNS) as f64 * 0.1 - 0.75))
 }
@@ -147,7 +146,7 @@ fn lerf_labels_are_judged_on_their_frames() {
         rectangle("chair", [0, 0, 30, 30]),
     ];
     label(&dir, "frame_00001", PHOTO_PX, &objects);
-    // Two parts of one thing; the camera stands 10 px farther to the right.
+    // One thing in two parts; the camera stands 10 px farther to the right.
     let parts = [rectangle("blue", [300, 80, 400, 399]), rectangle("blue", [400, 80, 539, 399])];
     label(&dir, "frame_00002", [640, 480], &parts);
     label(&dir, "frame_00009", PHOTO_PX, &objects);
@@ -179,7 +178,7 @@ fn lerf_labels_are_judged_on_their_frames() {
     assert_eq!(report.unknown_words.keys().collect::<Vec<_>>(), ["chair"]);
     assert!(report.to_string().contains("left out without a pose: frame_00009"));
 
-    // No word can be encoded: an error rather than an empty mean.
+    // Without any known word there is an error, not an empty mean.
     let mut only = labels.clone();
     only.frames.iter_mut().for_each(|frame| frame.things.retain(|thing| thing.category == "chair"));
     assert!(judge(&only, &wall.gaussians).expect_err("no word").to_string().contains("none of 1 words"));

@@ -50,7 +50,7 @@ impl MaskSource {
         if self == Self::Given { "given" } else { "automatic" }
     }
 
-    /// Returns the masks of a scene; `None` where it has no labels.
+    /// `None` for a scene without labels.
     fn masks(self, files: &SceneFiles) -> Option<Masks> {
         match self {
             Self::Given => files.true_masks.clone().map(|dir| Masks::Given { dir, ignore_ids: Vec::new() }),
@@ -59,7 +59,6 @@ impl MaskSource {
     }
 }
 
-/// What encodes scenes: models and devices, opened once.
 pub(crate) struct Runner {
     models: ModelDir,
     session: SessionOptions,
@@ -71,7 +70,7 @@ pub(crate) struct Runner {
 pub(crate) struct Encoded {
     pub(crate) reader: StoreReader,
     pub(crate) summary: EncodeSummary,
-    /// Seconds of the encode; few, where its views were there already.
+    /// Seconds of the encode; few if the store had its views already.
     pub(crate) secs: f64,
 }
 
@@ -90,8 +89,7 @@ impl Runner {
         Ok(self.models.text_encoder(&self.session)?)
     }
 
-    /// Encodes a scene with masks of a source as `change` says; `method` names the store. `None` where the scene
-    /// has no such masks.
+    /// Encodes a scene with masks of a source as `change` says; `method` names the store. `None` without such masks.
     pub(crate) fn encode(
         &self,
         files: &SceneFiles,
@@ -118,7 +116,6 @@ impl Runner {
     }
 }
 
-/// Reads the labels of the scene that a store was encoded from.
 pub(crate) fn truth_of(reader: &StoreReader, dir: &Path) -> Result<Truth> {
     let manifest = reader.manifest();
     Truth::read(dir, (manifest.n_gaussians + manifest.n_rejected) as usize)

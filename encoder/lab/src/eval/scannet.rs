@@ -64,7 +64,7 @@ const IDS_OF_15: [u16; 15] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 33, 34]
 const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
 /// More transparent Gaussians are ignored.
 const MIN_OPACITY: f32 = 0.1;
-/// Farther from every Gaussian, a vertex has no answer.
+/// A vertex farther than this from every Gaussian has no answer.
 const MAX_DISTANCE_M: f64 = 0.1;
 /// The paper's rows over its ten scenes: mIoU and mAcc of 19, 15 and 10 classes (Szilagyi, Engelmann, Bohg, RA-L
 /// 2025).
@@ -189,14 +189,14 @@ pub(super) fn judge(
 /// The Gaussian that answers each vertex, and its scores of each class.
 struct Answers<'a> {
     scan: &'a Scan,
-    /// `None`: no Gaussian is near; the vertex counts as wrong.
+    /// `None`: no Gaussian within reach; the vertex counts as wrong.
     nearest: &'a [Option<usize>],
-    /// Of each class; empty for an unknown word.
+    /// By class; empty for an unknown word.
     scores: &'a [Vec<f32>],
 }
 
 impl Answers<'_> {
-    /// Returns the best of some classes for a vertex; ties go to the first.
+    /// Best of some classes; ties go to the first.
     fn best(&self, gaussian: Option<usize>, classes: &[usize]) -> Option<usize> {
         let gaussian = gaussian?;
         let score =
@@ -205,7 +205,7 @@ impl Answers<'_> {
         scored.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))).map(|(class, _)| class)
     }
 
-    /// Compares answers with labels; means are over the classes that the scene has, as in the protocol.
+    /// Compares answers with labels; means are over the classes in the scene, as in the protocol.
     fn subset(&self, ids: &[u16], segments: Option<&[u32]>) -> Subset {
         let classes: Vec<usize> =
             (0..CLASSES.len()).filter(|class| ids.contains(&CLASSES[*class].0)).collect();
@@ -248,8 +248,7 @@ fn vote(answers: &mut [Option<usize>], segments: &[u32]) {
 
 fn nearest_gaussians(scan: &Scan, scene: &Gaussians) -> Vec<Option<usize>> {
     let counts = |k: &usize| scene.is_usable(*k) && scene.opacities[*k] >= MIN_OPACITY;
-    // Cubes of edge MAX_DISTANCE_M: a Gaussian within reach lies in the vertex's own cube or in a neighbouring
-    // one.
+    // Cubes of edge MAX_DISTANCE_M: a Gaussian within reach lies in the vertex's own or a neighbouring cube.
     let cube_of = |point: DVec3| (point / MAX_DISTANCE_M).floor().to_array().map(|v| v as i64);
     let mut cubes: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
     for k in (0..scene.len()).filter(counts) {
@@ -289,7 +288,6 @@ impl ScannetReport {
         Self { scenes, means, filtered_means, missing_scenes }
     }
 
-    /// Returns whether every word is known for every scene.
     pub(crate) fn is_complete(&self) -> bool {
         self.scenes.iter().all(|s| s.unknown_words.is_empty())
     }
@@ -340,7 +338,7 @@ pub(super) struct Scan {
     pub(super) dir: PathBuf,
     /// The vertices, world frame, metres.
     pub(super) vertices: Vec<[f64; 3]>,
-    /// `[N]`: NYU40 id of each, 0 where there is none.
+    /// `[N]`: NYU40 ids; 0 for none.
     pub(super) labels: Vec<u16>,
 }
 

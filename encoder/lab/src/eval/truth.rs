@@ -19,13 +19,13 @@ pub(super) struct Thing {
     pub(super) category: String,
     #[serde(default)]
     pub(super) words: Vec<String>,
-    /// What it is a kind of, in generated scenes.
+    /// Its kinds, such as furniture; generated scenes have them.
     #[serde(default)]
     pub(super) kinds: Vec<String>,
-    /// Pixels that show it, over all photos to encode; generated scenes have it.
+    /// Pixels that show it in the photos to encode; generated scenes have it.
     #[serde(default)]
     pub(super) train_pixels: u64,
-    /// Smallest and largest corner of its box, metres, where the labels have it.
+    /// Corners of its box, metres, where the labels have them.
     #[serde(default)]
     pub(super) aabb_min: DVec3,
     #[serde(default)]
@@ -34,10 +34,10 @@ pub(super) struct Thing {
 
 #[derive(Clone, Debug)]
 pub(crate) struct Truth {
-    /// The things, without floors and walls.
+    /// Without floors and walls.
     pub(super) things: Vec<Thing>,
     pub(super) background: Vec<Thing>,
-    /// `[N]`: the id of each Gaussian's thing; an id without a thing where there is none.
+    /// `[N]`: id of each Gaussian's thing; an id without a thing where there is none.
     pub(super) id_of_gaussian: Vec<u16>,
 }
 
@@ -58,7 +58,6 @@ pub(super) fn read_things(dir: &Path) -> Result<(Vec<Thing>, Vec<Thing>)> {
     Ok((instances, background))
 }
 
-/// Returns an error unless a splat has as many Gaussians as the store.
 pub(super) fn check_scene(reader: &StoreReader, n_scene: usize) -> Result<()> {
     let manifest = reader.manifest();
     let n_store = (manifest.n_gaussians + manifest.n_rejected) as usize;

@@ -27,11 +27,10 @@ const SHELL_M: f64 = 0.04;
 #[derive(Clone, Debug)]
 pub struct Placed {
     pub noun: usize,
-    /// Its parts, colours and paint.
     pub object: Object,
     pub world_from_object: DAffine3,
     pub bounds: Aabb,
-    /// Whether it belongs to the scene's shell, such as floor and walls.
+    /// Whether it is part of the scene's shell, such as floor and walls.
     pub shell: bool,
 }
 
@@ -54,7 +53,6 @@ struct Area {
     height_m: f64,
 }
 
-/// Things, light and areas to walk.
 #[derive(Clone, Debug)]
 pub struct Layout {
     pub placed: Vec<Placed>,
@@ -117,7 +115,7 @@ impl Layout {
         Self::new(&[kinds[(seed % 3) as usize]], seed, colours)
     }
 
-    /// Returns the solids to cast rays at, in the order of [`Layout::placed`].
+    /// Solids to cast rays at, in the order of [`Layout::placed`].
     pub fn solids(&self) -> Solids {
         let things = self.placed.iter().map(|p| Thing::new(&p.object.parts, p.world_from_object)).collect();
         Solids::new(things, self.light, self.ambient, self.tint)
@@ -163,7 +161,7 @@ impl Layout {
         self.placed.push(Placed { noun, object, world_from_object, bounds, shell });
     }
 
-    /// Returns a pose to try; `None` if there is no such place.
+    /// `None` if there is no such place.
     fn propose(
         &self,
         area: &Area,
@@ -206,7 +204,6 @@ impl Layout {
         })
     }
 
-    /// Returns a pose on top of something.
     fn on_top(&self, area: &Area, size: DVec3, random: &mut Xorshift) -> Option<DAffine3> {
         let tops: Vec<(&Placed, _)> = self
             .placed
@@ -220,7 +217,7 @@ impl Layout {
         let (below, top) = *random.pick(&tops);
         let half = [0, 1].map(|i| top.size_m[i] / 2.0 - size[i] / 2.0);
         if half.iter().any(|h| *h < 0.0) {
-            // Too large for this top, but another try may pick a larger one.
+            // Too large for this top; another try may pick a larger one.
             return Some(around_z(0.0, DVec3::splat(f64::MAX)));
         }
         let at = DVec3::new(half[0] * random.signed(), half[1] * random.signed(), top.z_m);
@@ -258,8 +255,8 @@ impl Layout {
         }
     }
 
-    /// Returns cameras all over the walkable places: places and headings are low-discrepancy sequences (Roberts'
-    /// R2, and the golden angle). They are fewer than asked for if there is hardly room.
+    /// Returns cameras all over the walkable places, with low-discrepancy places (Roberts' R2) and headings (golden
+    /// angle); fewer than `n_views` if there is hardly room.
     fn roam(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
         const STEP: DVec2 = DVec2::new(0.754_877_666_246_692_7, 0.569_840_290_998_053_2);
         const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
@@ -276,8 +273,7 @@ impl Layout {
         cameras.take(n_views as usize).collect()
     }
 
-    /// Returns cameras on an oval walk through each area, which look outwards and across in turn. The first stands
-    /// `start` steps along the oval.
+    /// Returns cameras on an oval walk through each area, looking outwards and across in turn, from step `start` on.
     pub fn walk(&self, n_views: u32, start: f64, intrinsics: Intrinsics) -> Vec<RasterView> {
         let n_areas = self.areas.len() as u32;
         (0..n_views)
@@ -314,7 +310,6 @@ impl Area {
             && bounds.max.z <= if self.kind == SceneKind::Room { self.height_m } else { f64::INFINITY }
     }
 
-    /// Returns the parts of a shell noun, such as floor or walls.
     fn shell(&self, name: &str, object: &Object) -> Vec<Part> {
         let (middle, size) = (self.corner + self.size / 2.0, self.size);
         let slab = |centre: DVec3, size: DVec3| Part {
@@ -371,7 +366,7 @@ fn bounds(parts: &[Part], world_from_object: DAffine3) -> Aabb {
     bounds
 }
 
-/// Returns the pose of a camera at `position` that looks along `heading`, upright.
+/// Pose of an upright camera at `position` that looks along `heading`.
 pub fn looking(position: DVec3, heading: DVec3) -> DAffine3 {
     let forward = heading.normalize();
     let right = forward.cross(DVec3::Z).normalize();
@@ -388,7 +383,6 @@ pub fn photo_intrinsics() -> Intrinsics {
     pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD)
 }
 
-/// Returns the intrinsics of an ideal pinhole with square pixels.
 pub fn pinhole([width_px, height_px]: [u32; 2], field_of_view_rad: f64) -> Intrinsics {
     raster::pinhole([width_px, height_px], f64::from(width_px) / 2.0 / (field_of_view_rad / 2.0).tan())
 }

@@ -12,7 +12,7 @@ use slag_common::splat::{self, ReadOptions};
 use slag_encoder::progress::Progress;
 use slag_math::stats::trimmed_range;
 
-/// Share of the means on either side of an axis that does not count for the distance of copies: floaters.
+/// Share of the means on either side of an axis that is ignored for the distance of copies: floaters.
 const TRIMMED: f64 = 0.005;
 /// Distance between copies, relative to their size.
 const SPACING: f64 = 1.1;
@@ -55,7 +55,7 @@ pub fn write(
     Ok(WrittenCopies { scene, views, masks, n_gaussians, spacing: grid.spacing })
 }
 
-/// Where copies stand. Which axis points up is not known: the grid spans the two longest sides.
+/// Where copies stand. The up axis is unknown, so the grid spans the two longest sides.
 struct Grid {
     n_copies: u32,
     up: usize,
@@ -85,7 +85,6 @@ impl Grid {
 struct Source {
     folder: PathBuf,
     gaussians: Gaussians,
-    /// The content of `transforms.json`.
     poses: Value,
     frames: Vec<Value>,
     masks: Option<PathBuf>,
@@ -130,7 +129,7 @@ impl Source {
         Ok(n_gaussians)
     }
 
-    /// Links the photo and the mask of a view, and returns its frame.
+    /// Links a view's photo and mask, and returns its frame.
     fn frame(&self, view: u32, n_views: u32, grid: &Grid, folder: &Path) -> Result<Value> {
         let [view, n_views, n_copies] = [view, n_views, grid.n_copies].map(u64::from);
         let copy = view * n_copies / n_views;
@@ -165,7 +164,7 @@ fn file_part(part: Option<&std::ffi::OsStr>) -> String {
     part.unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Makes `to` the same file as `from`, or a copy on another file system.
+/// Makes a hard link, or a copy on another file system.
 fn link(from: &Path, to: &Path) -> std::io::Result<()> {
     if to.exists() {
         fs_err::remove_file(to)?;

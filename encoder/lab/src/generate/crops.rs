@@ -59,8 +59,7 @@ pub struct Label {
     pub segmented: bool,
 }
 
-/// Returns whether a pair of noun and colour is held out for testing; a hash of its words decides, so new nouns do
-/// not affect other pairs.
+/// A hash of the words decides, so new nouns do not affect other pairs.
 pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
     // FNV-1a (Fowler, Noll, Vo).
     let words = noun.name.bytes().chain(colour.word().bytes());
@@ -130,7 +129,7 @@ pub(crate) fn crops(split: Split, seed: u64) -> Vec<(Crop, Label)> {
             if mask.area_px < MIN_MASK_PX || (shown < MIN_SHOWN && !placed.shell && !segmented) {
                 continue;
             }
-            // Every photo shows floor and walls; most of them are skipped.
+            // Every photo shows floor and walls, so most of them are skipped.
             if placed.shell && random.below(4) != 0 {
                 continue;
             }
@@ -189,7 +188,7 @@ fn masks_of(photo: &Photo) -> Vec<(u32, Mask)> {
     masks_of_labels(&labels, photo.image.width(), photo.unhidden_px.len(), u64::MAX).unwrap_or_default()
 }
 
-/// Returns the segments of a photo that show mostly one thing, with that thing.
+/// Returns the segments that mostly show one thing, with that thing.
 fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) -> Vec<(u32, Mask)> {
     let view = View {
         name: String::new(),
@@ -223,7 +222,6 @@ fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) 
     segments.into_iter().filter_map(|mask| Some((thing_of(&mask)?, mask))).collect()
 }
 
-/// Returns the mask without one of its sides, as a segmenter may find it.
 fn cut_mask(mask: &Mask, random: &mut Xorshift) -> Mask {
     let (width, height) = (mask.box_px.width_px(), mask.box_px.height_px());
     let angle = random.between(0.0, std::f64::consts::TAU);
@@ -260,7 +258,7 @@ mod tests {
         assert!(held_out(Split::Test) > 20);
     }
 
-    /// A crop has as many pixels inside its mask as its label states, and is white outside.
+    /// A crop has its label's number of pixels inside its mask, and is white outside.
     #[test]
     fn crops_are_what_their_labels_say() {
         let of_seed = |seed| crops(Split::Test, seed);

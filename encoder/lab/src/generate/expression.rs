@@ -31,7 +31,7 @@ impl Expression {
         }
     }
 
-    /// Returns the value; `variables` are in the order of the names.
+    /// `variables` are in the order of the names.
     pub fn value(&self, variables: &[f64], random: &mut Xorshift) -> f64 {
         match self {
             Self::Number(number) => *number,
@@ -60,7 +60,6 @@ struct Parser<'a> {
 }
 
 impl Parser<'_> {
-    /// Takes the next character if it is one of the symbols.
     fn take<T: Copy>(&mut self, symbols: &[(char, T)]) -> Option<T> {
         let first = self.rest.chars().next()?;
         let (_, meaning) = symbols.iter().find(|(symbol, _)| *symbol == first)?;

@@ -135,9 +135,9 @@ struct PartRule {
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {
-    /// Its parts, in its own frame: z up, the ground at 0, the front along +y.
+    /// In its own frame: z up, the ground at 0, the front along +y.
     pub parts: Vec<Part>,
-    /// Its colours, the main one first.
+    /// Main colour first.
     pub colours: Vec<Colour>,
     pub paint: Paint,
     pub top: Option<Top>,
@@ -250,7 +250,7 @@ impl Noun {
         let (Some(centre), Some(sizes)) = (fields.next(), fields.next()) else {
             return Err("no `|`, expected centre | sizes".into());
         };
-        // Loop variables are valid in the whole line and nowhere else.
+        // Loop variables are valid in their line only.
         let n_names = names.len();
         let modifiers: Vec<&str> = fields.collect();
         let mut loops = Vec::new();
@@ -350,7 +350,6 @@ fn found(text: &str) -> Result<(SceneKind, Place), String> {
 }
 
 impl PartRule {
-    /// Makes the parts of the loops from index `depth` on.
     fn make(
         &self,
         depth: usize,

@@ -114,7 +114,7 @@ impl Colour {
 }
 
 impl Material {
-    /// Returns the strength and sharpness (Phong's exponent) of its highlight.
+    /// Strength and sharpness (Phong's exponent) of its highlight.
     pub fn highlight(self) -> [f64; 2] {
         match self {
             Self::Metal => [0.45, 18.0],
@@ -129,7 +129,7 @@ impl Material {
 }
 
 impl Paint {
-    /// Returns the colour at a point of a part, in its own frame. `longest` is the part's longest axis.
+    /// Colour at a point of a part, in its own frame. `longest` is the part's longest axis.
     pub fn albedo(&self, at: DVec3, longest: usize) -> [f64; 3] {
         let noise = |scale: DVec3| value_noise(at * scale, self.seed);
         let even = |per_m: f64| noise(DVec3::splat(per_m));
@@ -156,8 +156,7 @@ impl Paint {
             Material::Brick | Material::Tile => {
                 let [width, height] =
                     if self.material == Material::Brick { [0.24, 0.08] } else { [0.3, 0.3] };
-                // Courses run along x and y alike, so that they continue around corners, and rise along z, on
-                // floors along y.
+                // Courses run along x and y alike, to continue around corners, and rise along z (on floors, y).
                 let up = if longest == 2 { at.z } else { at.z + at.y };
                 let course = (up / height).floor();
                 let shift = if self.material == Material::Brick { 0.5 * course } else { 0.0 };
@@ -175,7 +174,7 @@ impl Paint {
     }
 }
 
-/// Returns smooth noise of -1 to 1 with features one unit wide (value noise).
+/// Smooth noise of -1 to 1 with features one unit wide (value noise).
 fn value_noise(at: DVec3, seed: u32) -> f64 {
     let low = at.floor();
     let t = at - low;

@@ -20,7 +20,7 @@ pub enum Light {
 }
 
 impl Light {
-    /// Returns the direction from a point to the light (unit length), and its distance in metres.
+    /// Direction from a point to the light (unit length), and its distance in metres.
     fn from(self, at: DVec3) -> (DVec3, f64) {
         match self {
             Self::Sun(direction) => (direction, f64::INFINITY),
@@ -32,12 +32,11 @@ impl Light {
     }
 }
 
-/// Solids of one thing, in the world frame.
 #[derive(Clone, Debug)]
 pub struct Thing {
     pieces: Vec<Piece>,
     pub centre: DVec3,
-    /// Radius of the sphere around the centre that holds all of it.
+    /// Radius of a sphere around the centre that encloses it.
     pub radius_m: f64,
 }
 
@@ -65,7 +64,7 @@ pub struct Photo {
     pub thing_of_pixel: Vec<u16>,
     /// Depth at each pixel along the camera's axis, metres; infinite for the sky.
     pub depth_m: Vec<f32>,
-    /// Pixels that each thing would have without the other things.
+    /// Pixels that each thing would have without the others.
     pub unhidden_px: Vec<u32>,
 }
 
@@ -99,7 +98,7 @@ impl Thing {
         Self { pieces, centre, radius_m }
     }
 
-    /// Returns points on its surface about `spacing_m` apart, each with its piece.
+    /// Points on its surface about `spacing_m` apart, each with its piece.
     fn surfels(&self, spacing_m: f64) -> impl Iterator<Item = (&Piece, Surfel)> {
         self.pieces.iter().flat_map(move |piece| piece.part.surfels(spacing_m).map(move |s| (piece, s)))
     }
@@ -118,7 +117,7 @@ impl Piece {
     }
 }
 
-/// Returns whether a ray misses a sphere; `direction` has unit length.
+/// `direction` has unit length.
 fn misses(centre: DVec3, radius_m: f64, origin: DVec3, direction: DVec3) -> bool {
     let to_centre = centre - origin;
     let along = to_centre.dot(direction);
@@ -127,12 +126,12 @@ fn misses(centre: DVec3, radius_m: f64, origin: DVec3, direction: DVec3) -> bool
 }
 
 impl Solids {
-    /// Lights things; `ambient` is the share of ambient light, `tint` the colour of the light.
+    /// `ambient` is the share of ambient light, `tint` the colour of the light.
     pub fn new(things: Vec<Thing>, light: Light, ambient: f64, tint: [f64; 3]) -> Self {
         Self { things, light, ambient, tint }
     }
 
-    /// Returns the diffuse colour at a point of a surface, and whether the light reaches it.
+    /// Diffuse colour at a point of a surface, and whether the light reaches it.
     fn diffuse(&self, piece: &Piece, at: DVec3, normal: DVec3) -> ([f64; 3], bool) {
         let (towards, far) = self.light.from(at);
         let facing = normal.dot(towards);
@@ -227,7 +226,7 @@ impl Solids {
         photo
     }
 
-    /// Returns the things that intersect the cone from `origin` around `axis` that reaches to all of `directions`.
+    /// Returns the things that intersect the cone from `origin` around `axis` that includes all `directions`.
     fn things_within(&self, origin: DVec3, axis: DVec3, directions: &[DVec3]) -> Vec<usize> {
         let angle = |cosine: f64| cosine.clamp(-1.0, 1.0).acos();
         let spread = directions.iter().map(|direction| angle(direction.dot(axis))).fold(0.0, f64::max);
@@ -253,14 +252,14 @@ impl Solids {
         rgb.map(|c| c + highlight)
     }
 
-    /// Returns points that cover a thing about `spacing_m` apart, each with its lit colour.
+    /// Points that cover a thing about `spacing_m` apart, each with its lit colour.
     pub fn covering(&self, thing: usize, spacing_m: f64) -> Vec<(Surfel, [f64; 3])> {
         let surfels: Vec<_> = self.things[thing].surfels(spacing_m).collect();
         surfels.into_par_iter().map(|(piece, s)| (s, self.diffuse(piece, s.position, s.normal).0)).collect()
     }
 }
 
-/// Returns the colour of the sky, which is brighter at the horizon.
+/// Brighter at the horizon.
 fn sky(direction: DVec3) -> [f64; 3] {
     let up = direction.z.clamp(0.0, 1.0);
     [0.88 - 0.35 * up, 0.92 - 0.2 * up, 0.97]

@@ -28,10 +28,10 @@ const N_TEST_VIEWS: u32 = 6;
 const FIRST_ID: u16 = 10;
 
 pub struct Scene {
-    /// The Gaussians; metres, z up.
+    /// Metres, z up.
     pub gaussians: Gaussians,
     pub id_of_gaussian: Vec<u16>,
-    /// The objects, including floor and walls.
+    /// Including floor and walls.
     pub objects: Vec<TrueObject>,
     pub views: Vec<RasterView>,
     test_views: Vec<RasterView>,
@@ -145,7 +145,7 @@ impl Scene {
         Ok(WrittenScene { scene, views, truth })
     }
 
-    /// Writes photos, masks and poses; returns the number of pixels that show each object.
+    /// Returns the number of pixels that show each object.
     fn write_views(
         &self,
         views: &[RasterView],
@@ -191,7 +191,7 @@ impl Scene {
     }
 }
 
-/// Returns a view in the form of transforms.json: OpenGL axes, y up, z backward.
+/// A view in the form of transforms.json: OpenGL axes, y up, z backward.
 fn frame(file_path: String, view: &RasterView) -> serde_json::Value {
     let world_from_camera = view.camera_from_world.inverse();
     let [x, y, z] = world_from_camera.matrix3.to_cols_array_2d().map(DVec3::from);

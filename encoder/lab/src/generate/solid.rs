@@ -7,23 +7,22 @@ use super::paint::Paint;
 /// The shape of a part, around its own origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
-    /// A box with these half edges.
+    /// Half edges.
     Box(DVec3),
     /// A cylinder or truncated cone around z.
     Cone {
-        /// Radii at the lower and the upper end.
+        /// At the lower and the upper end.
         radii_m: [f64; 2],
         half_height_m: f64,
     },
-    /// An ellipsoid with these half axes.
+    /// Half axes.
     Ellipsoid(DVec3),
 }
 
-/// A part of an object: a painted shape with a pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Part {
     pub shape: Shape,
-    /// Its pose in the object's or the world's frame: a rotation and a translation.
+    /// Pose in the object's or the world's frame: a rotation and a translation.
     pub object_from_part: DAffine3,
     pub paint: Paint,
 }
@@ -35,7 +34,7 @@ pub struct Surfel {
 }
 
 impl Part {
-    /// Returns points on the surface, about `spacing_m` apart, in the object's frame.
+    /// Points on the surface, about `spacing_m` apart, in the object's frame.
     pub fn surfels(&self, spacing_m: f64) -> impl Iterator<Item = Surfel> {
         self.shape.surfels(spacing_m).into_iter().map(|s| Surfel {
             position: self.object_from_part.transform_point3(s.position),
@@ -45,7 +44,7 @@ impl Part {
 }
 
 impl Shape {
-    /// Returns the radius of the sphere around the origin that holds it.
+    /// Radius of a sphere around the origin that encloses it.
     pub fn radius_m(self) -> f64 {
         match self {
             Self::Box(half) => half.length(),
@@ -62,9 +61,8 @@ impl Shape {
         (0..3).max_by(|a, b| half[*a].total_cmp(&half[*b])).unwrap_or(2)
     }
 
-    /// Returns the distance at which a ray enters, in multiples of `direction`, and the normal there.
-    ///
-    /// `None` for a ray that misses or starts inside.
+    /// Distance at which a ray enters, in multiples of `direction`, and the normal there; `None` if it misses or starts
+    /// inside.
     pub fn hit(self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
         match self {
             Self::Box(half) => {
@@ -118,7 +116,7 @@ impl Shape {
         }
     }
 
-    /// Returns whether a point lies inside, surface included.
+    /// Surface included.
     #[cfg(any(test, feature = "measure"))]
     pub fn contains(self, p: DVec3) -> bool {
         match self {
@@ -185,7 +183,7 @@ impl Shape {
     }
 }
 
-/// Returns the solutions of a t^2 + 2 b t + c = 0 in ascending order.
+/// Solutions of a t^2 + 2 b t + c = 0, ascending.
 fn roots(a: f64, b: f64, c: f64) -> Option<[f64; 2]> {
     let discriminant = b * b - a * c;
     (discriminant >= 0.0 && a != 0.0).then(|| {
@@ -195,13 +193,13 @@ fn roots(a: f64, b: f64, c: f64) -> Option<[f64; 2]> {
     })
 }
 
-/// Returns the middles of equal steps of at most `spacing` over `-half..half`.
+/// Middles of equal steps of at most `spacing` over `-half..half`.
 fn grid(half: f64, spacing: f64) -> impl Iterator<Item = f64> + Clone {
     let n = (2.0 * half / spacing).ceil().max(1.0) as u32;
     (0..n).map(move |i| half * ((2 * i + 1) as f64 / f64::from(n) - 1.0))
 }
 
-/// Returns unit directions around z, at most `spacing` apart at radius `radius`.
+/// Unit directions around z, at most `spacing` apart at radius `radius`.
 fn ring(radius: f64, spacing: f64) -> impl Iterator<Item = DVec3> {
     let n = (std::f64::consts::TAU * radius / spacing).ceil().max(3.0) as u32;
     (0..n).map(move |i| {

@@ -32,7 +32,6 @@ pub(crate) fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
 }
 
 impl Service {
-    /// Returns the JSON of a resource, whatever its status.
     pub(crate) fn get(&self, path: &str) -> Result<Value> {
         let body = agent().get(format!("{}{path}", self.url)).call()?.body_mut().read_to_string()?;
         serde_json::from_str(&body).with_context(|| path.to_owned())
@@ -43,7 +42,6 @@ impl Service {
         self.send(path, "application/json", body.to_string().as_bytes())
     }
 
-    /// Sends a PNG as [`Self::post`] sends JSON.
     pub(crate) fn post_image(&self, path: &str, png: &[u8]) -> Result<Value> {
         self.send(path, "image/png", png)
     }
@@ -55,13 +53,12 @@ impl Service {
     }
 }
 
-/// Returns a client that asks without a proxy and returns replies of every status.
+/// A client without a proxy, for which no status is an error.
 fn agent() -> ureq::Agent {
     let config = ureq::Agent::config_builder().proxy(None).http_status_as_error(false);
     config.timeout_global(Some(TIMEOUT)).build().into()
 }
 
-/// Copies a whole store to an empty cache as a robot does.
 pub(crate) fn fetch_all(store: &Path, cache: &Path, profile: &str) -> Result<()> {
     remove(cache)?;
     fetch(store, cache, &["--at", "0,0,0", "--radius", "1e6", "--profile", profile]).map(|_| ())
@@ -69,7 +66,6 @@ pub(crate) fn fetch_all(store: &Path, cache: &Path, profile: &str) -> Result<()>
 
 /// Generated scenes on robots, of each kind and seed in a folder of its own: `scene`, `store` and `cache`.
 pub(crate) struct Prepared<'a> {
-    /// Folder of the scenes' folders.
     pub(crate) out: &'a Path,
     pub(crate) kinds: &'a [SceneKind],
     pub(crate) seeds: &'a [u64],
@@ -80,7 +76,7 @@ pub(crate) struct Prepared<'a> {
 }
 
 impl Prepared<'_> {
-    /// Judges each scene by its kind, seed and folder; returns their names.
+    /// Judges each scene by kind, seed and folder; returns the names.
     pub(crate) fn judge(
         &self,
         progress: &dyn Progress,
@@ -102,7 +98,6 @@ impl Prepared<'_> {
         Ok(names)
     }
 
-    /// Generates, encodes and fetches a scene, as far as that was not done before.
     fn make(&self, kind: SceneKind, seed: u64, dir: &Path) -> Result<()> {
         let [scene, store, cache] = ["scene", "store", "cache"].map(|name| dir.join(name));
         let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));

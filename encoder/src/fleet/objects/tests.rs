@@ -26,7 +26,7 @@ fn a_scene_comes_back_bit_by_bit() {
         sh_degree: 0,
     };
     let bytes = pack_scene(&scene).expect("packs");
-    // NaN differs from itself, so the columns are compared by their bytes.
+    // NaN differs from itself, so bytes are compared.
     assert_eq!(pack_scene(&unpack_scene(&bytes).expect("reads")).expect("packs"), bytes);
     unpack_scene(&bytes[..bytes.len() - 1]).expect_err("cut");
 }

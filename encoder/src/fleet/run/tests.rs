@@ -19,8 +19,7 @@ fn plan() -> RunPlan {
     }
 }
 
-/// A second coordinator takes the place of the first, which cannot publish any more; a published run is not
-/// superseded, but followed.
+/// A second coordinator supersedes the first, which can no longer publish; a published run is followed instead.
 #[test]
 fn one_put_decides_who_publishes() {
     let dir = tempfile::tempdir().expect("a folder");

@@ -4,7 +4,7 @@ use super::*;
 use crate::progress::Silent;
 use crate::raster::CpuRasterizer;
 
-/// A folder lives as long as its worker; what a killed worker left goes with the next one, and nothing else does.
+/// A folder lives as long as its worker; the next worker removes a killed one's folder, and nothing else.
 #[test]
 fn folders_go_with_their_workers() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -18,7 +18,7 @@ fn folders_go_with_their_workers() {
     let first = RunFolder::make(&scratch).expect("made");
     fs_err::create_dir_all(first.path().join("photos")).expect("made");
     fs_err::write(first.path().join("photos/a.png"), "a").expect("written");
-    // As a killed worker leaves it, and as neighbours have theirs.
+    // A killed worker's folder, and neighbours'.
     let left = scratch.join("slag-worker-left-1");
     fs_err::create_dir_all(left.join("photos")).expect("made");
     fs_err::write(left.join(LOCK), "").expect("written");
@@ -35,7 +35,7 @@ fn folders_go_with_their_workers() {
     assert_eq!(names(), foreign);
 }
 
-/// A worker with another bucket than its coordinator's would be done, without an error, with nothing.
+/// A worker on another bucket than its coordinator would otherwise end without an error or any work.
 #[test]
 fn a_worker_that_finds_no_run_says_so() {
     let dir = tempfile::tempdir().expect("a folder");

@@ -12,14 +12,14 @@ use crate::lift::index::PartContributions;
 use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::lift::table::RegionTable;
 
-/// Most masks of a mixture, the heaviest first: enough for a hundred views of a few masks each.
+/// Most masks of a mixture, heaviest first: enough for a hundred views of a few masks each.
 const MAX_MASKS: usize = 256;
-/// Contributions for each pair of superpoint and region, at least: those of the Gaussians of a superpoint.
+/// Least contributions per pair of superpoint and region: a superpoint has several Gaussians.
 const ENTRIES_PER_SUM: u64 = 8;
 /// Evidence of a filled Gaussian, pixels: almost none.
 const FILLED_WEIGHT_PX: f32 = 1e-3;
 
-/// Returns the direction of each of a part's Gaussians, rounded to 8 bits; zeros where there is no evidence.
+/// Direction of each of a part's Gaussians, in 8 bits; zeros without evidence.
 pub(super) fn sketches(contributions: &PartContributions, region_points: &[Point]) -> Vec<[i8; AXES]> {
     let sketch_of = |k: usize| -> [i8; AXES] {
         let mut sum = sum_of(contributions, contributions.entries_of(k), region_points);
@@ -29,12 +29,11 @@ pub(super) fn sketches(contributions: &PartContributions, region_points: &[Point
     (0..contributions.part.locals.len()).into_par_iter().map(sketch_of).collect()
 }
 
-/// The summed contributions of the Gaussians that a part has of each superpoint: `(superpoint, [(region,
-/// weight)])`.
+/// A part's summed contributions by superpoint: `(superpoint, [(region, weight)])`.
 pub(super) struct PartSums(Vec<(usize, Vec<(u32, f32)>)>);
 
 impl PartSums {
-    /// Adds up the contributions of a part's Gaussians. `gaussians`: their scene indices.
+    /// `gaussians`: scene indices of the part's Gaussians.
     pub(super) fn new(
         contributions: &PartContributions,
         gaussians: &[u32],
@@ -62,11 +61,11 @@ impl PartSums {
     }
 }
 
-/// The summed contributions of each superpoint's Gaussians so far: `(region, weight)`, one run a part.
+/// Summed contributions of each superpoint so far: `(region, weight)`, one run a part.
 pub(super) struct SuperpointSums(Vec<Vec<(u32, f32)>>);
 
 impl SuperpointSums {
-    /// Returns the bytes that the sums of a partition take, of `n_entries` contributions.
+    /// Bytes of a partition's sums of `n_entries` contributions.
     pub(super) fn len_bytes(n_entries: u64) -> u64 {
         n_entries / ENTRIES_PER_SUM * size_of::<(u32, f32)>() as u64
     }
@@ -75,51 +74,49 @@ impl SuperpointSums {
         Self(vec![Vec::new(); n_superpoints])
     }
 
-    /// Adds the contributions of a part's Gaussians.
     pub(super) fn add(&mut self, of_part: PartSums) {
         for (superpoint, entries) in of_part.0 {
             let sum = &mut self.0[superpoint];
-            // Most superpoints lie within a part.
+            // Most superpoints lie within one part.
             if sum.is_empty() { *sum = entries } else { sum.extend(entries) }
         }
     }
 }
 
-/// Returns the sum of the values of each key, ascending by key.
+/// Sums values by key, ascending by key.
 fn summed_by_key(mut entries: Vec<(u32, f32)>) -> Vec<(u32, f32)> {
-    // A stable sort: values are added in the order given.
+    // Stable sort: values are added in the given order.
     entries.sort_by_key(|(key, _)| *key);
     let sum = |run: &[(u32, f32)]| (run[0].0, run.iter().map(|(_, v)| f64::from(*v)).sum::<f64>() as f32);
     entries.chunk_by(|a, b| a.0 == b.0).map(sum).collect()
 }
 
-/// The region of a mixture, and the length of its point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct MixtureRegion {
     pub(super) region: u32,
     pub(super) length: f32,
 }
 
-/// The entry that a Gaussian gets, and the share of its own entries that remains.
+/// A Gaussian's additional entry, and the remaining share of its own.
 struct AddedEntry {
     region: u32,
     weight: f32,
     kept: f32,
 }
 
-/// The superpoints of a scene as regions of its table.
+/// A scene's superpoints as regions of its table.
 #[derive(Debug, PartialEq)]
 pub(super) struct Mixtures {
-    /// Weight of a mixture, relative to the Gaussian's own entries.
+    /// Relative to the Gaussian's own entries.
     pub(super) weight: f32,
-    /// `[N]`: superpoint of each Gaussian of the scene.
+    /// `[N]`.
     pub(super) of_gaussian: Vec<u32>,
-    /// The region of each superpoint; `None` without evidence.
+    /// By superpoint; `None` without evidence.
     pub(super) regions: Vec<Option<MixtureRegion>>,
 }
 
 impl Mixtures {
-    /// Appends a region to the table for each superpoint with evidence.
+    /// Appends a region for each superpoint with evidence.
     pub(super) fn new(
         weight: f32,
         superpoints: Superpoints,
@@ -155,8 +152,7 @@ impl Mixtures {
         Ok(Self { weight, of_gaussian: superpoints.of_gaussian, regions })
     }
 
-    /// Adds an entry of its superpoint to each Gaussian of a part. With `fill`, a Gaussian without evidence takes
-    /// the superpoint's mixture alone.
+    /// Adds its superpoint's entry to each Gaussian of a part. With `fill`, Gaussians without evidence take that alone.
     pub(super) fn apply(
         &self,
         contributions: &mut PartContributions,
@@ -201,10 +197,10 @@ impl Mixtures {
     }
 }
 
-/// Principal axes. 48 keep nine tenths of the variance of mask vectors of 512 components (measured).
+/// Number of principal axes: 48 keep nine tenths of the variance of mask vectors of 512 components (measured).
 pub(super) const AXES: usize = 48;
 
-/// A vector's coordinates along the principal axes.
+/// Coordinates along the principal axes.
 pub(super) type Point = [f32; AXES];
 
 #[inline(always)]
@@ -216,7 +212,7 @@ pub(super) fn length(point: &Point) -> f32 {
     dot(point, point).sqrt()
 }
 
-/// Scales a point to unit length; zeros stay zeros.
+/// Zeros stay zeros.
 pub(super) fn make_unit(point: &mut Point) {
     let length = length(point);
     if length > 0.0 {
@@ -237,7 +233,6 @@ pub(super) fn points_of_regions(
     regions.into_par_iter().map(point).collect()
 }
 
-/// Returns the weighted sum of the regions of some entries.
 pub(super) fn sum_of(
     contributions: &PartContributions,
     entries: Range<usize>,

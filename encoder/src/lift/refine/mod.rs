@@ -7,16 +7,13 @@
 //! | `mixture` | `superpoint`, `coarse`, `object` | a Gaussian takes a share of its superpoint, then of a larger one, then of its object |
 //! | `mixture` | `fill` | a Gaussian without evidence takes its superpoint's mean |
 //!
-//! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a
-//! superpoint or object is one more region of it: a mixture of masks. So scores, shards and the published field
-//! need no special case, and a Gaussian gets at most three more entries.
+//! The result is again sparse contributions over regions. Masks' weights go into the [`RegionTable`], and a superpoint
+//! or object is one more region: a mixture of masks. So scores, shards and the published field need no special case,
+//! and a Gaussian gets at most three more entries.
 //!
-//! The table belongs to the step at work: [`PendingRefinement::begin`] takes the views' table and weighs its
-//! masks; objects are found from the pending refinement; [`PendingRefinement::finish`] returns the table with the
-//! mixtures.
-//!
-//! All decisions are made in principal coordinates of the mask vectors (`points`) and in one order: the result
-//! depends neither on threads nor on the memory budget.
+//! [`PendingRefinement::begin`] takes the views' table and weighs its masks; objects are found from the pending
+//! refinement; [`PendingRefinement::finish`] returns the table with the mixtures. Decisions are made in principal
+//! coordinates of the mask vectors (`points`) and in one order: the result depends neither on threads nor on memory.
 
 mod mixture;
 mod prune;
@@ -35,40 +32,40 @@ use crate::memory::{self, MemoryPlan, Phase};
 use mixture::{AXES, Mixtures, PartSums, Point, SuperpointSums};
 pub use settings::Aggregation;
 
-/// Least base of a mask's weight: a mask that is wholly cut off still gives its Gaussians evidence.
+/// Least base of a mask's weight: even a mask that is wholly cut off gives evidence.
 const LEAST_MASK_WEIGHT: f32 = 0.01;
 
-/// The refinements of a scene, ready to be applied part by part.
+/// A scene's refinements, ready to be applied part by part.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Refinement {
     settings: Aggregation,
-    /// Of each view, ascending.
+    /// By view, ascending.
     first_regions: Vec<u32>,
-    /// `[n_regions]`: summed weight of each region's masks.
+    /// `[n_regions]`: summed weight of the region's masks.
     mask_counts: Vec<f32>,
-    /// `[n_regions]`: each region's vector; empty where none is needed.
+    /// `[n_regions]`: the regions' vectors; empty if not needed.
     region_points: Vec<Point>,
-    /// Of the finer superpoints, then of the larger ones, then of the objects.
+    /// Of finer superpoints, larger ones, then objects.
     mixtures: Vec<Mixtures>,
 }
 
-/// A refinement of which masks are weighed and superpoints found. Objects, made of superpoints, come next; then
-/// Gaussians share evidence within both.
+/// A refinement with weighed masks and superpoints. Objects, made of superpoints, come next; then Gaussians share
+/// evidence within both.
 pub(crate) struct PendingRefinement {
     refinement: Refinement,
     table: RegionTable,
-    /// `[n_masks]`: each mask's vector in principal coordinates; empty where none is needed.
+    /// `[n_masks]`: vectors in principal coordinates; empty if not needed.
     mask_points: Vec<Point>,
-    /// The superpoints of each scale with their weights, the finer ones first.
+    /// Superpoints by scale with their weights, finer ones first.
     scales: Vec<(f32, Superpoints)>,
 }
 
-/// Weight of a filler beside other masks: where a view outlines a thing, another that does not says little.
+/// Weight of a filler relative to other masks: where one view outlines a thing, another without outline says little.
 const FILLER_WEIGHT: f32 = 0.1;
-/// Weight of a mask of what stands on the ground: it shows a thing alone, where others show its parts or more.
+/// Weight of a mask of a standing thing: it shows the thing alone, where others show parts or more.
 const STANDING_WEIGHT: f32 = 2.0;
 
-/// Returns the weight of each mask of some photos: (1 - truncation)^power, by its kind.
+/// Weight of each mask: (1 - truncation)^power, by its kind.
 fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
     let weight = |outline: &MaskOutline| {
         let of_kind = match outline.level as u8 {
@@ -81,7 +78,7 @@ fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
     photos.iter().flat_map(|photo| &photo.outlines).map(weight).collect()
 }
 
-/// Returns objects, `[cell][N of the cell]`, as a partition of the scene.
+/// Turns objects, `[cell][N of the cell]`, into a partition of the scene.
 fn partition_of(scene: &SceneContributions<'_>, object_of: &[Vec<u32>]) -> Superpoints {
     let mut of_gaussian = vec![NO_SUPERPOINT; scene.gaussians.len()];
     for (cell, of_cell) in scene.split.cells.iter().zip(object_of) {
@@ -94,7 +91,7 @@ fn partition_of(scene: &SceneContributions<'_>, object_of: &[Vec<u32>]) -> Super
 }
 
 impl PendingRefinement {
-    /// Decides the weights of masks and finds superpoints, in one pass over all contributions.
+    /// Weighs masks and finds superpoints, in one pass over all contributions.
     pub fn begin(
         settings: Aggregation,
         scene: &SceneContributions<'_>,
@@ -122,21 +119,18 @@ impl PendingRefinement {
         Ok(pending)
     }
 
-    /// Returns the regions of all views, their masks weighed.
     pub fn table(&self) -> &RegionTable {
         &self.table
     }
 
-    /// Returns the finer superpoints, if the settings ask for them.
+    /// The finer superpoints, if the settings ask for them.
     pub(crate) fn superpoints(&self) -> Option<&Superpoints> {
         let has_fine = self.refinement.settings.has_fine_superpoints();
         self.scales.first().filter(|_| has_fine).map(|(_, superpoints)| superpoints)
     }
 
-    /// Adds mixtures of the masks of superpoints and objects to the table, in one pass over all contributions.
-    ///
-    /// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, [`NO_SUPERPOINT`] where it has none;
-    /// empty without objects.
+    /// Adds mixtures of superpoints' and objects' masks to the table, in one pass over all contributions. `object_of`:
+    /// `[cell][N of the cell]`, [`NO_SUPERPOINT`] for none; empty without objects.
     pub fn finish(
         self,
         scene: &SceneContributions<'_>,
@@ -154,7 +148,6 @@ impl PendingRefinement {
 }
 
 impl Refinement {
-    /// Returns the superpoints of each scale with their weights.
     fn superpoints(
         &self,
         scene: &SceneContributions<'_>,
@@ -171,7 +164,7 @@ impl Refinement {
                 sketches[*gaussian as usize * AXES..][..AXES].copy_from_slice(&sketch);
             }
         })?;
-        // The parts of the pass are gone; without this the graph would come on top of them.
+        // The pass's parts are gone; unless given back, the graph's memory would come on top.
         memory::give_back();
         let sketches = Sketches { width: AXES, values: &sketches };
         let graph =
@@ -187,7 +180,6 @@ impl Refinement {
         Ok(fine.into_iter().chain(larger).collect())
     }
 
-    /// Appends the mixtures of superpoints and objects to the table.
     fn make_mixtures(
         &mut self,
         scene: &SceneContributions<'_>,
@@ -207,15 +199,14 @@ impl Refinement {
         for ((weight, superpoints), sums) in scales.into_iter().zip(sums) {
             self.mixtures.push(Mixtures::new(weight, superpoints, sums, table, mask_points)?);
         }
-        // The next scale is mixed with rows that hold entries of those before it.
+        // The next scale mixes rows that already have the earlier scales' entries.
         let of_mixtures =
             mixture::points_of_regions(table, mask_points, self.region_points.len()..table.len());
         self.region_points.extend(of_mixtures);
         Ok(())
     }
 
-    /// Reserves the lists over all Gaussians: the superpoints' graph, and each Gaussian's superpoints until the
-    /// last cell.
+    /// Reserves lists over all Gaussians: the superpoints' graph, and each Gaussian's superpoints until the last cell.
     pub(crate) fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
         let n_scales = settings.n_scales();
         if settings.needs_superpoints() {
@@ -231,8 +222,7 @@ impl Refinement {
         }
     }
 
-    /// Reserves what depends on the views: the lists over all regions, and the summed contributions of
-    /// superpoints.
+    /// Reserves what depends on the views: lists over all regions, and the superpoints' summed contributions.
     pub(crate) fn reserve_contributions(
         memory: &mut MemoryPlan,
         settings: &Aggregation,
@@ -247,7 +237,7 @@ impl Refinement {
         memory.reserve(Phase::Refine, "sums of superpoints", sums_bytes);
     }
 
-    /// Refines the contributions of a part. `gaussians`: scene indices of its Gaussians.
+    /// `gaussians`: scene indices of the part's Gaussians.
     pub(crate) fn apply(&self, contributions: &mut PartContributions, gaussians: &[u32]) {
         self.prune(contributions);
         for mixtures in &self.mixtures {

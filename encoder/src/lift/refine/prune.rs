@@ -6,16 +6,15 @@ use rayon::prelude::*;
 
 use crate::lift::index::PartContributions;
 
-/// Gaussians that a thread works on at a time, at least.
+/// Least number of Gaussians per task.
 const CHUNK: usize = 4096;
 
-/// A Gaussian's entries in one view, and their total weight.
 struct ViewEntries {
     entries: Range<usize>,
     weight: f32,
 }
 
-/// Cuts the entries of a Gaussian, ascending by region, into its views. `first_regions`: of each view, ascending.
+/// Splits a Gaussian's entries, ascending by region, by view. `first_regions`: of each view, ascending.
 fn by_view(
     contributions: &PartContributions,
     entries: Range<usize>,
@@ -38,8 +37,8 @@ fn by_view(
     views
 }
 
-/// Drops the entries of views in which a Gaussian has less than `min_view_share` of its weight in its best view.
-/// `mask_counts`: `[n_regions]`, the summed weight of each region's masks.
+/// Drops entries of views where a Gaussian has less than `min_view_share` of its weight in its best view.
+/// `mask_counts`: `[n_regions]`, summed weight of the region's masks.
 pub(super) fn prune(
     contributions: &mut PartContributions,
     min_view_share: f32,

@@ -31,8 +31,8 @@ impl Aggregation {
         object: 0.0,
         fill: false,
     };
-    /// The refinements that help both on trained splats and on generated ones (docs/decisions.md). Larger shares
-    /// of superpoints smooth small things away.
+    /// The refinements that help on both trained and generated splats (docs/decisions.md). Larger shares of superpoints
+    /// smooth small things away.
     pub(crate) const REFINED: Self = Self {
         min_view_share: 0.05,
         truncation_power: 2.0,
@@ -50,12 +50,12 @@ impl Aggregation {
         self.has_fine_superpoints() || self.coarse > 0.0
     }
 
-    /// Returns whether Gaussians share evidence: then vectors are needed in principal coordinates.
+    /// Gaussians share evidence, so vectors are needed in principal coordinates.
     pub(super) fn needs_mixtures(&self) -> bool {
         self.needs_superpoints() || self.object > 0.0
     }
 
-    /// Returns the number of partitions within which Gaussians share evidence.
+    /// Partitions within which Gaussians share evidence.
     pub(super) fn n_partitions(&self) -> usize {
         self.n_scales() + usize::from(self.object > 0.0)
     }

@@ -22,7 +22,7 @@ fn random(seed: u64) -> f64 {
     (mix64(seed) >> 20) as f64 / (1u64 << 44) as f64
 }
 
-/// Three patches of 30 Gaussians, far apart and each of a colour.
+/// Three patches of 30 Gaussians, far apart, one colour each.
 fn gaussians() -> Gaussians {
     let at =
         |i: usize| DVec3::new((i / 30 * 10) as f64 + (i % 6) as f64 * 0.1, (i % 30 / 6) as f64 * 0.1, 0.0);
@@ -41,12 +41,12 @@ fn split() -> CellSplit {
     CellSplit { cells: vec![cell], cell_of_gaussian: vec![0; N], local_of_gaussian, ..CellSplit::default() }
 }
 
-/// The first two patches are objects, except that every fourth Gaussian belongs to none.
+/// The first two patches are objects, but every fourth Gaussian belongs to none.
 fn object_of() -> [Vec<u32>; 1] {
     [(0..N).map(|i| if i < 60 && i % 4 > 0 { i as u32 / 30 } else { NO_SUPERPOINT }).collect()]
 }
 
-/// Views of two masks a patch, which overlap; the masks of view 3 have the others' vectors turned round.
+/// Views with two overlapping masks per patch; view 3 has the others' vectors reversed.
 fn views() -> Vec<ViewContributions> {
     let view = |v: u64| {
         let vector = |mask: u64| {
@@ -83,7 +83,7 @@ fn views() -> Vec<ViewContributions> {
     (0..7).map(view).collect()
 }
 
-/// The same box for all masks, of which the photos' edges cut off between nothing and all.
+/// One box for all masks, of which photos' edges cut off between nothing and all.
 fn is_filler(v: usize, mask: usize) -> bool {
     (v + mask).is_multiple_of(5)
 }
@@ -137,7 +137,7 @@ fn lift(
     Lifted { field, table, embeddings }
 }
 
-/// Entries of a Gaussian in float64, view by view: `(masks of the view, region, weight)`.
+/// A Gaussian's entries in float64, by view: `(masks of the view, region, weight)`.
 fn row(views: &[ViewContributions], k: usize) -> Vec<Vec<(usize, f64)>> {
     let of_view = |view: &ViewContributions| {
         let entries = view.entries_of_cell[0].1.iter().filter(|e| e.local as usize == k);
@@ -155,7 +155,7 @@ fn pruned(rows: Vec<Vec<(usize, f64)>>, settings: &Aggregation) -> Vec<Vec<(usiz
     rows.into_iter().map(kept).collect()
 }
 
-/// `Σ weight * how often the mask counts * its vector` over a view's entries.
+/// `Σ weight * mask's count * its vector` over a view's entries.
 fn contribution(view: &ViewContributions, entries: &[(usize, f64)], counts: &[f64]) -> Vec<f64> {
     let mut sum = vec![0.0; DIM];
     for (region, weight) in entries {
@@ -176,7 +176,7 @@ fn unit(v: &[f64]) -> Vec<f64> {
     v.iter().map(|x| x / norm(v).max(1e-12)).collect()
 }
 
-/// The sum of some Gaussians' rows, where every mask counts once.
+/// Sum of Gaussians' rows, with every mask counted once.
 fn sum_of(views: &[ViewContributions], gaussians: impl IntoIterator<Item = usize>) -> Vec<f64> {
     let mut sum = vec![0.0; DIM];
     for k in gaussians {
@@ -187,7 +187,7 @@ fn sum_of(views: &[ViewContributions], gaussians: impl IntoIterator<Item = usize
     sum
 }
 
-/// What masks count, by the definition, with everything in float64 and no axes.
+/// Masks' weights by the definition, in float64 without axes.
 fn oracle_counts(views: &[ViewContributions], settings: &Aggregation) -> Vec<Vec<f64>> {
     let whole = |v: usize, mask: usize| {
         let of_kind = if is_filler(v, mask) && settings.truncation_power > 0.0 { 0.1 } else { 1.0 };
@@ -203,7 +203,7 @@ fn assert_near(found: &[f32], expected: &[f64], what: &str) {
     }
 }
 
-/// Oracle: the table and the contributions as they were read.
+/// Oracle: table and contributions as read.
 #[test]
 fn the_plain_average_changes_neither_table_nor_contributions() {
     let Scene { index, table, .. } = &open(&views(), DIM, &[N], u64::MAX);
@@ -232,7 +232,7 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
                 (0..DIM).for_each(|c| expected[c] += part[c]);
             }
             assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("{settings:?} {k}"));
-            // Scores are those of the embeddings, by the published numbers alone.
+            // Scores equal those of the embeddings, from the published numbers alone.
             let query: Vec<f32> = (0..DIM).map(|c| random(c as u64) as f32).collect();
             let cosine = field.cosines(&table.scores(&query))[k];
             assert!((cosine - dot(&embeddings[k * DIM..][..DIM], &query)).abs() < 1e-4);
@@ -276,8 +276,8 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
     }
 }
 
-/// Oracle: in float64, a third of a row is the sum of its object's Gaussians, by length; others are left as they
-/// are. Superpoints come first.
+/// Oracle in float64: a third of a row is the sum of its object's Gaussians, by length; other rows are unchanged.
+/// Superpoints come first.
 #[test]
 fn an_object_gives_its_part_to_its_gaussians() {
     let views = views();
@@ -313,7 +313,6 @@ fn threads_and_budget_do_not_show() {
     assert!(run(3, 1) == expected);
 }
 
-/// One mask and one view say nothing against each other.
 #[test]
 fn a_single_view_keeps_its_evidence() {
     let view = ViewContributions {
@@ -325,7 +324,7 @@ fn a_single_view_keeps_its_evidence() {
     let outline = MaskOutline { box_px: [0, 0, 8, 8], ..MaskOutline::default() };
     let photos = [Photo { name: "0".into(), outlines: vec![outline] }];
     let Lifted { field, embeddings, .. } = lift(&[view], 64, &photos, Aggregation::REFINED, u64::MAX);
-    // Its patch is filled, the others know nothing.
+    // Its patch is filled, the others have no evidence.
     assert!((0..N).all(|k| field.has_evidence(k) == (k < 30)));
     assert!((0..30).all(|k| (embeddings[k * 64 + 3] - 1.0).abs() < 1e-6));
 }

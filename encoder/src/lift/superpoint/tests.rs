@@ -61,7 +61,7 @@ fn small_pieces_are_joined_and_unusable_gaussians_have_none() {
     assert!(found.sizes().iter().all(|size| *size >= 20), "{:?}", found.sizes());
 }
 
-/// Twelve Gaussians of the ground's colour and direction stay a thing of their own, though superpoints have twenty.
+/// Twelve Gaussians in the ground's colour and direction stay separate, though superpoints have twenty.
 #[test]
 fn what_stands_on_the_ground_is_no_part_of_it() {
     let ground = (0..10_000).map(|i| [f64::from(i % 100) * 0.02, f64::from(i / 100) * 0.02, 0.0]);

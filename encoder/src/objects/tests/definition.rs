@@ -4,18 +4,18 @@ use std::collections::{BTreeSet, HashSet};
 
 use super::*;
 
-/// What views show: of each view, the masks of each Gaussian that it sees; masks numbered within the view.
+/// By view: the masks of each Gaussian that it sees; masks numbered within the view.
 type Views = Vec<BTreeMap<u32, BTreeSet<u32>>>;
 
-/// Things of [`made_views`]: rows of Gaussians, in superpoints of ten.
+/// Things of [`made_views`]: rows of Gaussians in superpoints of ten.
 const N_THINGS: u32 = 6;
 const PER_ROW: u32 = 40;
 const PER_SUPERPOINT: u32 = 10;
-/// Masks a view: one a thing, two for parts, one of everything.
+/// Masks per view: one a thing, two for parts, one of everything.
 const N_MASKS: u32 = N_THINGS + 3;
 
-/// Eight views of six things: seven in ten Gaussians are seen. View 2 has one mask for things 0, 1 and 3, view 5
-/// three for thing 2; half of the views have one for everything.
+/// Eight views of six things see seven in ten Gaussians. View 2 has one mask for things 0, 1 and 3, view 5 three for
+/// thing 2; half of the views have one for everything.
 fn made_views(random: &mut Random) -> Views {
     let view = |view: u32| {
         let mut of_view = BTreeMap::new();
@@ -29,7 +29,7 @@ fn made_views(random: &mut Random) -> Views {
                 (5, 2) => [2, N_THINGS, N_THINGS + 1][gaussian as usize % 3],
                 _ => thing,
             };
-            // Ragged: one in twenty shows something else's mask, one in ten none.
+            // Ragged: one in twenty has another thing's mask, one in ten none.
             let own = if random.below(20) == 0 { random.below(u64::from(N_THINGS)) as u32 } else { own };
             let masks = [
                 Some(own).filter(|_| random.below(10) > 0),
@@ -45,7 +45,7 @@ fn made_views(random: &mut Random) -> Views {
     (0..8).map(view).collect()
 }
 
-/// Views that mean nothing: few of them, masks of blocks and of chance.
+/// Meaningless views: few, with masks of blocks and of chance.
 fn random_views(random: &mut Random) -> Views {
     let n_views = 1 + random.below(5);
     let view = |_| {
@@ -61,8 +61,7 @@ fn random_views(random: &mut Random) -> Views {
     (0..n_views).map(view).collect()
 }
 
-/// The definition, set by set: each superpoint's object, numbered by their first superpoints, and the masks of
-/// each.
+/// The definition, set by set: each superpoint's object, numbered by first superpoints, and each object's masks.
 fn oracle(
     views: &Views,
     pairs: &[(u32, u32)],
@@ -110,8 +109,7 @@ fn oracle(
             evidence.insert((*a as usize, *b as usize), (together, all));
         }
     }
-    // Sets of superpoints, joined one pair at a time; every sum is made anew. A set goes by one of its
-    // superpoints.
+    // Sets of superpoints, joined pair by pair; every sum is made anew. A set goes by one of its superpoints.
     let mut sets: Vec<Vec<usize>> = (0..n).map(|superpoint| vec![superpoint]).collect();
     let mut named: BTreeMap<usize, usize> = (0..n).map(|set| (set, set)).collect();
     let mut parts: BTreeMap<usize, [usize; 2]> = BTreeMap::new();
@@ -193,7 +191,7 @@ fn objects_are_those_of_the_definition() {
         let mut random = Random::new(seed);
         for views in [made_views(&mut random), random_views(&mut random)] {
             let (mut world, superpoints) = world_of(&views);
-            // Outlines of boxes of 10 x 10 pixels, half of them cut off somewhere.
+            // Outlines of boxes of 10 x 10 pixels, half of them cut off.
             let outlines = world.photos.iter_mut().flat_map(|photo| &mut photo.outlines);
             outlines.for_each(|outline| outline.cut_px = random.below(9_u32).saturating_sub(4) * 3);
             let uncut = |view: usize, mask: u32| {
@@ -219,7 +217,7 @@ fn objects_are_those_of_the_definition() {
     assert!(n_objects > 100, "{n_objects}");
 }
 
-/// Oracle: the things that the views were made of, in spite of masks of several, of parts and of everything.
+/// Oracle: the views' things, in spite of masks of several, of parts and of everything.
 #[test]
 fn things_are_found_among_masks_of_parts_and_of_everything() {
     let (world, superpoints) = world_of(&made_views(&mut Random::new(1)));
@@ -231,7 +229,7 @@ fn things_are_found_among_masks_of_parts_and_of_everything() {
     }
 }
 
-/// Files of contributions that show what the views show, with superpoints of ten Gaussians.
+/// Contribution files of these views, with superpoints of ten Gaussians.
 fn world_of(views: &Views) -> (World, Superpoints) {
     let n = PER_ROW * N_THINGS;
     let mean = |i: u32| DVec3::new(f64::from(i / PER_ROW) * 3.0, f64::from(i % PER_ROW) * 0.1, 0.0);
@@ -265,8 +263,8 @@ fn world_of(views: &Views) -> (World, Superpoints) {
     (World::new(gaussians, split, &views), superpoints)
 }
 
-/// By hand: two views have one mask for things 0 and 1, four outline thing 0 and only fill thing 1. Together they have
-/// the consensus (2 + 4 / 2) / 6, thing 0 alone (2 / 2 + 4) / 6, and thing 1 is what no outline shows.
+/// By hand: two views have one mask for things 0 and 1; four outline thing 0 and only fill thing 1. Together they have
+/// the consensus (2 + 4 / 2) / 6, thing 0 alone (2 / 2 + 4) / 6; no outline shows thing 1.
 #[test]
 fn what_views_outline_ends_where_they_only_fill() {
     let masks = |view: u32, gaussian: u32| BTreeSet::from([u32::from(view >= 2 && gaussian >= PER_ROW)]);

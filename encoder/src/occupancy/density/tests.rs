@@ -16,8 +16,8 @@ fn random_scene(random: &mut Random, n: usize) -> Gaussians {
     scene
 }
 
-/// Oracle: the definition, in f64, for every voxel and every Gaussian; voxels within a thousandth of the threshold
-/// may fall on either side, since sums are f32.
+/// Oracle: the definition in f64 for every voxel and Gaussian; sums are f32, so voxels within a thousandth of the
+/// threshold may differ.
 #[test]
 fn voxels_are_occupied_as_defined() {
     let mut random = Random::new(17);
@@ -57,8 +57,7 @@ fn voxels_are_occupied_as_defined() {
     assert!(n_occupied > 200 && n_undecided < n_occupied / 20, "{n_occupied} {n_undecided}");
 }
 
-/// By hand: a wide thin Gaussian is a surface; a ball of fog and a Gaussian that is wider than 8 tiles of 64
-/// voxels are not.
+/// By hand: a wide thin Gaussian is a surface; a ball of fog and a Gaussian wider than 8 tiles of 64 voxels are not.
 #[test]
 fn background_is_left_out() {
     let mut scene = Gaussians::balls((0..3).map(|k| DVec3::X * 100.0 * f64::from(k)).collect(), 0.0);
@@ -69,8 +68,7 @@ fn background_is_left_out() {
     assert!(!found.blocks.is_empty() && found.blocks.iter().all(|([x, ..], _)| x.abs() < 20));
 }
 
-/// Reaches beyond 32 bits of tiles, and beyond 64 bits of voxels, are background, too; so are means beyond the
-/// lattice.
+/// Reaches beyond 32 bits of tiles or 64 bits of voxels, and means beyond the lattice, are background.
 #[test]
 fn the_largest_gaussians_are_background() {
     for scale in [1.5e9, 1e15, 1e25, f32::MAX] {
@@ -85,13 +83,13 @@ fn the_largest_gaussians_are_background() {
     }
 }
 
-/// A place is the same wherever it lies on the lattice: voxels of a power of two make the offset exact, up to the
-/// last block of the lattice. Beyond that nothing is stored, and everything is counted.
+/// Voxels of a power of two make the offset exact, up to the lattice's last block. Beyond it nothing is stored, and
+/// everything is counted.
 #[test]
 fn places_at_the_ends_of_the_lattice_are_the_same() {
     let mut random = Random::new(8);
     let lattice = Lattice { voxel: 0.0625 };
-    // On a grid of 2^-12, which doubles hold at the ends of the lattice, too.
+    // On a grid of 2^-12, which doubles resolve even at the ends of the lattice.
     let mut mean = || DVec3::from([0; 3].map(|_| random.below(1 << 14) as f64 / 4096.0 - 2.0));
     let mut scene = Gaussians::balls((0..60).map(|_| mean()).collect(), 0.0);
     scene.scales.fill([0.2, 0.1, 0.01]);
@@ -116,8 +114,8 @@ fn places_at_the_ends_of_the_lattice_are_the_same() {
     assert_eq!((beyond.n_background, beyond.blocks.len()), (scene.len(), 0));
 }
 
-/// A plane of opaque Gaussians, 2 mm thick, in any direction: every voxel that it cuts is occupied, and none whose
-/// centre is farther than one and a half edges.
+/// A plane of opaque Gaussians, 2 mm thick, in any direction: every voxel that it cuts is occupied, and none with its
+/// centre farther than one and a half edges.
 #[test]
 fn a_thin_surface_has_no_holes() {
     let mut random = Random::new(5);

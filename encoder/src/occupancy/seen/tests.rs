@@ -8,8 +8,8 @@ use super::*;
 
 const LATTICE: Lattice = Lattice { voxel: 0.1 };
 
-/// Looks from a random place near the origin. A third of the pixels show a surface 0.3 to 3 m away in patches,
-/// others the sky or something half transparent.
+/// A view near the origin. A third of the pixels show patches of surface 0.3 to 3 m away, the others the sky or
+/// something half transparent.
 fn random_picture(random: &mut Random) -> (RasterView, Drawing) {
     let rotation = DQuat::from_xyzw(random.normal(), random.normal(), random.normal(), random.normal());
     let place = DVec3::from([0; 3].map(|_| random.between(-1.0, 1.0)));
@@ -21,7 +21,7 @@ fn random_picture(random: &mut Random) -> (RasterView, Drawing) {
         centre_y_px: 16.0,
         ..pinhole([width_px, height_px], 30.0)
     };
-    // Patches of 8 x 8 pixels: the neighbours of a pixel mostly agree.
+    // Patches of 8 x 8 pixels, so that neighbours mostly agree.
     let patches: Vec<(f32, f32)> = (0..20)
         .map(|_| (*random_of(random, &[1.0, 0.6, 0.5, 0.4, 0.05, 0.0]), random.between(0.3, 3.0) as f32))
         .collect();

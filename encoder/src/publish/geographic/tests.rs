@@ -23,8 +23,8 @@ fn assert_rings(polygons: &MultiPolygon, what: &str) {
     }
 }
 
-/// Oracle: the ellipsoid's radii of curvature from its two defining constants. 100 m east subtend
-/// 100 / (N cos lat), 100 m north 100 / M.
+/// Oracle: the ellipsoid's radii of curvature from its two defining constants. 100 m east subtend 100 / (N cos lat),
+/// 100 m north 100 / M.
 #[test]
 fn footprint_agrees_with_the_radii_of_curvature() {
     let e2 = (2.0 - 1.0 / 298.257223563) / 298.257223563;

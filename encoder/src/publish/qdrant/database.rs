@@ -19,17 +19,17 @@ use super::{IndexSettings, PushError, PushOptions, Snapshot};
 use crate::store::{StoreReader, StoredShard};
 
 const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
-/// Time limit of one request, and of one for a snapshot.
+/// Time limits of a request, and of one for a snapshot.
 const TIMEOUT: Duration = Duration::from_secs(60);
 const SNAPSHOT_TIMEOUT: Duration = Duration::from_secs(3600);
 
 pub(super) struct Database<'a> {
     client: Qdrant,
-    /// For requests that take as long as their collection is large.
+    /// For requests whose time grows with the collection.
     patient_client: Qdrant,
     options: &'a PushOptions,
     n_retries: AtomicU64,
-    /// Whether it has answered a request.
+    /// Whether it ever answered.
     is_reached: AtomicBool,
 }
 
@@ -43,7 +43,7 @@ impl<'a> Database<'a> {
                 .api_key(options.api_key.as_deref())
                 .timeout(timeout)
                 .connect_timeout(TIMEOUT)
-                // The check prints to standard output.
+                // The check would print to stdout.
                 .skip_compatibility_check()
                 .build()
                 .map_err(|cause| database_error(options, "set up the client", &cause))
@@ -66,7 +66,7 @@ impl<'a> Database<'a> {
         self.n_retries.load(Ordering::Relaxed)
     }
 
-    /// Sends a request until it succeeds, fails permanently, or no attempts are left.
+    /// Repeats a request until it succeeds, fails permanently, or no attempts are left.
     async fn attempt<T, F>(&self, action: &'static str, request: impl Fn() -> F) -> Result<T, PushError>
     where
         F: Future<Output = Result<T, QdrantError>>,
@@ -82,7 +82,7 @@ impl<'a> Database<'a> {
                 }
                 Err(error) => error,
             };
-            // One that restarts during a push comes back; one that was never there is at another address.
+            // One that restarts during a push comes back; one that never answered is at another address.
             let is_lasting = |pause: Duration| {
                 is_unreachable(&error)
                     && !self.is_reached.load(Ordering::Relaxed)
@@ -109,7 +109,7 @@ fn database_error(options: &PushOptions, action: &'static str, cause: &QdrantErr
     PushError::Database { url: options.url.clone(), action, cause: words(cause) }
 }
 
-/// Returns what an error says, without the metadata of its response and the transport's insides.
+/// An error's text, without its response's metadata and the transport's internals.
 fn words(error: &QdrantError) -> String {
     let (QdrantError::ResponseError { status } | QdrantError::ResourceExhaustedError { status, .. }) = error
     else {
@@ -121,12 +121,12 @@ fn words(error: &QdrantError) -> String {
     text.to_owned() + &cause.map_or(String::new(), |cause| format!(": {cause}"))
 }
 
-/// Returns whether a text is a URL with a host, and a port if it has one: a client tries others for a minute.
+/// Whether a text is a URL with a host and a valid port, if any: with others, a client tries for a minute.
 fn is_address(url: &str) -> bool {
     let Some((scheme, rest)) = url.split_once("://") else { return false };
     let host = rest.split(['/', '?', '#']).next().unwrap_or(rest);
     let host = host.rsplit('@').next().unwrap_or(host);
-    // The colons of an IPv6 address are in brackets.
+    // An IPv6 address has its colons in brackets.
     let (name, port) = match host.rsplit_once(':') {
         Some((name, port)) if !port.contains(']') => (name, Some(port)),
         _ => (host, None),
@@ -137,19 +137,17 @@ fn is_address(url: &str) -> bool {
         && port.is_none_or(|port| port.parse::<u16>().is_ok())
 }
 
-/// Returns whether no connection was made.
 fn is_unreachable(error: &QdrantError) -> bool {
     matches!(error, QdrantError::ResponseError { status } if status.message().starts_with("Failed to connect"))
 }
 
-/// Returns whether the same request may succeed later.
 fn may_pass(error: &QdrantError) -> bool {
     match error {
         QdrantError::ResourceExhaustedError { .. } | QdrantError::Io(_) => true,
-        // Codes of gRPC (`statuscodes.md` of its specification).
+        // gRPC codes (`statuscodes.md` of its specification).
         QdrantError::ResponseError { status } => match status.code() as i32 {
-            // Unavailable, deadline exceeded, resource exhausted, aborted; cancelled and unknown: the client's own
-            // time limit, and a connection that broke during a request.
+            // Unavailable, deadline exceeded, resource exhausted, aborted; cancelled and unknown: the client's own time
+            // limit, and a connection that broke during a request.
             14 | 4 | 8 | 10 | 1 | 2 => true,
             // Internal: a refused connection.
             13 => is_unreachable(error),
@@ -159,7 +157,6 @@ fn may_pass(error: &QdrantError) -> bool {
     }
 }
 
-/// A collection that is to hold a scene, or a cell of it.
 pub(super) struct Collection<'a> {
     pub(super) database: &'a Database<'a>,
     pub(super) name: String,
@@ -167,7 +164,7 @@ pub(super) struct Collection<'a> {
 }
 
 impl Collection<'_> {
-    /// Returns the collection as it is, if it exists; fails if it cannot take this scene. Changes nothing.
+    /// Returns the existing collection, unchanged; fails if it cannot take this scene.
     pub(super) async fn existing(&self) -> Result<Option<CollectionInfo>, PushError> {
         let exists = || self.database.client.collection_exists(self.name.as_str());
         if !self.database.attempt("look for the collection", exists).await? {
@@ -206,7 +203,7 @@ impl Collection<'_> {
         Ok(info.result.unwrap_or_default())
     }
 
-    /// Creates the collection, without payload indexes.
+    /// Without payload indexes.
     pub(super) async fn create(&self, index: &IndexSettings) -> Result<(), PushError> {
         let request = index.create(&self.name, self.manifest.encoder.dim.into());
         let create = || self.database.client.create_collection(request.clone());
@@ -223,8 +220,8 @@ impl Collection<'_> {
         self.database.attempt("delete the collection", delete).await.map(drop)
     }
 
-    /// Creates the payload indexes that are not in `existing`: an earlier push may have been cut off between
-    /// the collection and its indexes, or may not have been geo-referenced.
+    /// Creates the payload indexes missing in `existing`: an earlier push may have been cut off before them, or not
+    /// have been geo-referenced.
     pub(super) async fn ensure_indexes(
         &self,
         existing: &HashMap<String, PayloadSchemaInfo>,
@@ -248,7 +245,7 @@ impl Collection<'_> {
         self.database.attempt("upsert points", upsert).await.map(drop)
     }
 
-    /// Deletes the points of Gaussians that this generation no longer has.
+    /// Deletes points of Gaussians that this generation no longer has.
     pub(super) async fn remove_other_generations(&self) -> Result<(), PushError> {
         let delete = || {
             let others = Filter::must_not([Condition::matches("generation", generation(self.manifest))]);
@@ -302,7 +299,7 @@ impl CellShard {
         }
     }
 
-    /// Returns the number of points: Gaussians that have an embedding.
+    /// Gaussians with an embedding.
     pub(super) fn n_points(&self) -> usize {
         self.stored.view().n_with_evidence()
     }
@@ -312,7 +309,7 @@ impl CellShard {
         u64::from(n_gaussians) - self.n_points() as u64
     }
 
-    /// Builds some of the points, in the shard's order.
+    /// In the shard's order.
     pub(super) fn points(&self, range: std::ops::Range<usize>, manifest: &Manifest) -> Vec<PointStruct> {
         let shard = self.stored.view();
         let Some(exact) = &shard.exact else { return Vec::new() };

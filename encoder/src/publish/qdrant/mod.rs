@@ -1,12 +1,11 @@
 //! Pushes a scene's embeddings into Qdrant: one point a Gaussian.
 //!
-//! A collection holds one scene, or one cell of it ([`Layout`]). The id of a point is the Gaussian's index in the
-//! input splat file. Its payload has `x`, `y`, `z` (world frame), `cell_id`, `scene`, `generation` and, if the
-//! scene is geo-referenced, `location` (`lat`, `lon`).
+//! A collection holds one scene, or one cell of it ([`Layout`]). A point's id is the Gaussian's index in the input
+//! splat file. Its payload has `x`, `y`, `z` (world frame), `cell_id`, `scene`, `generation` and, if the scene is
+//! geo-referenced, `location` (`lat`, `lon`).
 //!
-//! Each batch is acknowledged as applied before the next is sent, then recorded in the store, so that an
-//! interrupted push continues there. Upserts by id are idempotent: a batch whose acknowledgement was lost
-//! may be sent again.
+//! Each batch is acknowledged as applied and recorded in the store before the next is sent, so that an interrupted push
+//! continues there. Upserts by id are idempotent: a batch without acknowledgement may be sent again.
 
 mod database;
 mod push;
@@ -74,7 +73,6 @@ pub struct PushOptions {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct PushProgress {
-    /// Points of this generation in the database.
     pub(crate) n_points: u64,
     /// Points of this generation at the end.
     pub(crate) n_points_expected: u64,

@@ -9,10 +9,8 @@ use super::database::{CellShard, Collection, Database};
 use super::{Layout, PushError, PushOptions, PushProgress, PushReport};
 use crate::store::StoreReader;
 
-/// Pushes the current generation of a store, continuing where an earlier push of it was interrupted.
-///
-/// `records`: the store's record database ([`crate::store::Store::db`]). `progress` is called after
-/// every batch. `cancel`: completes to stop between or within batches.
+/// Pushes a store's current generation, continuing an interrupted push of it. `records`: the store's record database
+/// ([`crate::store::Store::db`]). `progress` is called after every batch. `cancel`: completes to stop at any time.
 ///
 /// # Errors
 /// [`PushError`]. All collections are checked before anything is written.
@@ -43,7 +41,6 @@ struct Record {
     n_without_evidence: u64,
 }
 
-/// The records of the collections of one database, in the store.
 struct Records<'a> {
     tree: sled::Tree,
     url: &'a str,
@@ -56,11 +53,11 @@ impl Records<'_> {
 
     fn read(&self, collection: &str) -> Result<Option<Record>, PushError> {
         let stored = self.tree.get(self.key(collection))?;
-        // An unreadable record (of another version) counts as none: the push starts over.
+        // An unreadable record (of another version) counts as absent: the push starts over.
         Ok(stored.and_then(|bytes| serde_json::from_slice(&bytes).ok()))
     }
 
-    /// Writes a record, to the disk.
+    /// Flushes to disk.
     async fn write(&self, collection: &str, record: &Record) -> Result<(), PushError> {
         let json = serde_json::to_vec(record).expect("a record is JSON");
         self.tree.insert(self.key(collection), json)?;
@@ -68,7 +65,7 @@ impl Records<'_> {
         Ok(())
     }
 
-    /// Removes a record, from the disk too.
+    /// Flushes to disk.
     async fn remove(&self, collection: &str) -> Result<(), PushError> {
         self.tree.remove(self.key(collection))?;
         self.tree.flush_async().await?;
@@ -77,7 +74,6 @@ impl Records<'_> {
 }
 
 impl Layout {
-    /// Returns the collections for a scene, with the cells of each.
     fn divide<'a>(self, name: &str, manifest: &'a Manifest) -> Vec<(String, &'a [CellRecord])> {
         let cells = manifest.cells.as_slice();
         match self {
@@ -93,10 +89,10 @@ fn cell_collection(name: &str, cell_id: u32) -> String {
     format!("{name}-cell-{cell_id}")
 }
 
-/// Returns whether a collection is named as that of a cell, of this scene or an earlier generation of it.
+/// Whether a collection has the name of a cell's, of this scene or an earlier generation.
 fn is_of_cell(name: &str, collection: &str) -> bool {
     let id = collection.strip_prefix(name).and_then(|rest| rest.strip_prefix("-cell-"));
-    // An id has one spelling: `+7` and `007` are not ours.
+    // Ids have one spelling: `+7` and `007` are not ours.
     id.and_then(|id| id.parse().ok()).is_some_and(|id| cell_collection(name, id) == collection)
 }
 
@@ -108,7 +104,6 @@ struct Push<'a> {
     report: PushReport,
 }
 
-/// A collection, and the cells that it is to hold.
 struct Target<'a> {
     collection: Collection<'a>,
     cells: &'a [CellRecord],
@@ -144,7 +139,6 @@ impl<'a> Push<'a> {
         Collection { database: self.database, name, manifest: self.reader.manifest() }
     }
 
-    /// Makes a collection ready and sends the points that it lacks.
     async fn push_target(
         &mut self,
         target: &Target<'a>,
@@ -156,7 +150,7 @@ impl<'a> Push<'a> {
         let n_points_expected = manifest.n_gaussians.saturating_sub(manifest.n_without_evidence);
         let n_points_before = self.report.n_points;
         for cell in target.cells.iter().skip(record.n_cells) {
-            // No request is under way that the reading of a shard could hold up.
+            // No request is under way that reading a shard could delay.
             let shard = CellShard::load(self.reader, cell)?;
             while record.n_points_in_cell < shard.n_points() {
                 let start = record.n_points_in_cell;
@@ -179,8 +173,8 @@ impl<'a> Push<'a> {
         self.check_count(collection, record.n_points).await
     }
 
-    /// Creates the collection if there is none, gives it the settings asked for and its payload indexes, and
-    /// returns the progress of earlier pushes.
+    /// Creates the collection if missing, applies the settings and payload indexes, and returns the progress of earlier
+    /// pushes.
     async fn prepare(&mut self, target: &Target<'a>) -> Result<Record, PushError> {
         let (collection, name) = (&target.collection, &target.collection.name);
         let info = match &target.existing {
@@ -191,7 +185,7 @@ impl<'a> Push<'a> {
                 info.clone()
             }
             None => {
-                // First, so that a push cut off here does not take the new collection for the old one.
+                // First, so that a push cut off here does not mistake the new collection for the old one.
                 self.records.remove(name).await?;
                 collection.create(&self.options.index).await?;
                 self.report.n_created_collections += 1;
@@ -205,8 +199,8 @@ impl<'a> Push<'a> {
         Ok(record)
     }
 
-    /// Deletes the collections of cells that the scene no longer has. Those with points of other scenes stay,
-    /// and those that no push from this store made.
+    /// Deletes collections of cells that the scene no longer has, except those with other scenes' points and those that
+    /// no push from this store made.
     async fn remove_obsolete(&mut self, targets: &[Target<'a>]) -> Result<(), PushError> {
         let mut names = self.database.collection_names().await?;
         names.sort_unstable();
@@ -223,8 +217,7 @@ impl<'a> Push<'a> {
         Ok(())
     }
 
-    /// Compares the number of points in the collection with the number pushed; if they differ, the next push
-    /// starts this collection over.
+    /// If the collection has another number of points than were pushed, the next push starts it over.
     async fn check_count(&self, collection: &Collection<'a>, expected: u64) -> Result<(), PushError> {
         let found = collection.count(Filter::default()).await?;
         if found == expected {

@@ -57,7 +57,7 @@ impl IndexSettings {
         request
     }
 
-    /// Returns the request that gives an existing collection these settings; `None` where none is given.
+    /// Applies these settings to an existing collection; `None` if none is given.
     pub(super) fn update(&self, name: &str) -> Option<UpdateCollection> {
         let vectors = VectorParamsDiff { on_disk: Some(true), ..Default::default() };
         let vectors = VectorsConfigDiff { config: Some(vectors_config_diff::Config::Params(vectors)) };
@@ -96,7 +96,7 @@ impl Quantisation {
             }
             Self::Binary => Some(Stored::Binary(BinaryQuantization { always_ram, ..Default::default() })),
             Self::Product => {
-                // Of 32-bit components: one byte for four of them.
+                // Of 32-bit components: one byte for four.
                 let compression = CompressionRatio::X16.into();
                 Some(Stored::Product(ProductQuantization { compression, always_ram, memory: None }))
             }
@@ -114,7 +114,7 @@ impl Quantisation {
     }
 }
 
-/// Returns the settings of a collection's only vector; `None` if it has several or none.
+/// Settings of a collection's only vector; `None` if it has several or none.
 pub(super) fn vectors_of(config: Option<VectorsConfig>) -> Option<VectorParams> {
     match config?.config? {
         vectors_config::Config::Params(vectors) => Some(vectors),

@@ -48,7 +48,7 @@ pub(super) struct CellsQuery {
 }
 
 impl CellsQuery {
-    /// Returns centre and radius in the world frame.
+    /// Centre and radius in the world frame.
     fn ball_in_world(self, manifest: &Manifest) -> Result<(DVec3, f64), Problem> {
         if !(self.radius >= 0.0 && self.radius.is_finite()) {
             let expected = "a finite number, not negative, in units of the world frame";

@@ -19,10 +19,8 @@ pub use slag_service::access::Access;
 pub(crate) use slag_service::access::AccessSettings;
 pub use state::Limits;
 
-/// Serves until `shutdown` completes, then lets answers in progress finish within the drain deadline.
-///
-/// `on_listening` gets the address to connect to, `http://IP:PORT` (`https` with TLS) or `unix:PATH`: the system
-/// chooses the port if `listen` has port 0.
+/// Serves until `shutdown` completes, then lets answers finish within the drain deadline. `on_listening` gets the
+/// address to connect to, `http://IP:PORT` (`https` with TLS) or `unix:PATH`; for port 0 the system chooses the port.
 ///
 /// # Errors
 /// Fails if the address cannot be listened on.
@@ -37,7 +35,7 @@ pub async fn serve(
     let listener = bind(&listen).await?.with_tls(tls);
     on_listening(listener.url().map_err(|cause| ListenError { address: listen, cause })?);
     if let Err(cut_off) = listener::serve(router, listener, limits.connections, shutdown).await {
-        // A robot continues its download at the next start.
+        // A robot resumes its download at the next start.
         tracing::warn!("{cut_off}");
     }
     Ok(())

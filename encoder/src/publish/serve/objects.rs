@@ -24,12 +24,11 @@ use super::problem;
 use super::state::{AppState, Snapshot};
 use crate::store::metadata::{TIMESTAMP_FILE, read_published};
 
-/// Pieces in which objects are read and sent.
 const PIECE_BYTES: usize = 64 << 10;
 const JSON: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/json")];
 const BINARY: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];
 
-/// Content with its hash as an entity tag: `D`, or nothing where the client has it.
+/// Content with its hash as entity tag: `D`, or nothing if the client has it.
 pub(super) struct Tagged<D>(PhantomData<D>);
 
 const ETAG: &[(&str, &str)] = &[("etag", "Hash of the content.")];
@@ -119,7 +118,7 @@ pub(super) async fn object(
     Ok(As::new(response))
 }
 
-/// A listed object: its length, and its file where the content is needed.
+/// A listed object: its length, and its file if the content is needed.
 struct Opened {
     file: Option<std::fs::File>,
     len_bytes: u64,
@@ -145,7 +144,7 @@ type Name = Result<UrlPath<String>, PathRejection>;
 
 pub(super) async fn metadata(State(service): AppState, name: Name) -> Result<As<Json<Envelope>>, Problem> {
     let UrlPath(name) = name.map_err(|e| problem::bad_parameter(e.body_text()))?;
-    // All but the timestamp never change.
+    // Only the timestamp ever changes.
     let lasting = if name == TIMESTAMP_FILE { "no-cache" } else { "public, max-age=31536000, immutable" };
     let read = service.with_current(move |snapshot| {
         let read = read_published(snapshot.reader.dir(), &name).map_err(Problem::internal)?;

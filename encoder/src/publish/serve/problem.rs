@@ -5,7 +5,7 @@ use slag_service::problem::Problem;
 
 use crate::publish::geographic::GeographicError;
 
-/// Time after which a request beyond a limit may succeed.
+/// Delay after which a request beyond a limit may succeed.
 const RETRY_SECS: u32 = 2;
 
 pub(super) fn bad_parameter(detail: impl Into<String>) -> Problem {
@@ -17,7 +17,7 @@ pub(super) fn not_published(what: &str) -> Problem {
     Problem::new(StatusCode::NOT_FOUND, "not-found", "Not found", detail)
 }
 
-/// The scene has no place on the earth, so the resource does not exist in its current state.
+/// Without a place on the earth, the resource does not exist in the scene's current state.
 pub(super) fn not_geo_referenced(error: GeographicError) -> Problem {
     let detail = error.to_string();
     Problem::new(StatusCode::CONFLICT, "not-geo-referenced", "Scene is not geo-referenced", detail)

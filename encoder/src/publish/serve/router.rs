@@ -31,7 +31,6 @@ use super::{cells, objects, problem};
 use crate::store::StoreError;
 use crate::store::metadata::TIMESTAMP_FILE;
 
-/// This service, as its help text and description name it.
 const ABOUT: About = About {
     name: "slag-encoder serve",
     version: env!("CARGO_PKG_VERSION"),
@@ -41,10 +40,10 @@ const ABOUT: About = About {
 };
 const PAGE: &str = "/view";
 const STORE: [(u16, &str); 1] = [(500, "The service failed.")];
-/// No request here needs a body; a few bytes of a careless client do no harm.
+/// No request needs a body; a few bytes do no harm.
 const REQUEST_BODY_BYTES: usize = 1024;
 
-/// Returns the service of a store with a page's routes beside, without a listener.
+/// A store's service with a page's routes, without a listener.
 pub(crate) fn router(dir: &Path, limits: Limits, access: Access, page: Router) -> Result<Router, StoreError> {
     let service = Arc::new(Service::open(dir, &limits)?);
     let responses = Arc::clone(&service.responses);
@@ -52,8 +51,8 @@ pub(crate) fn router(dir: &Path, limits: Limits, access: Access, page: Router) -
     Ok(counted(router.with_state(service).merge(page), limits, responses, access))
 }
 
-/// Puts the limits around routes of a page, and a problem as the body of every error. Where a service lists its
-/// resources this one sends browsers to the page.
+/// Wraps a page's routes in the limits, with a problem as the body of every error. Instead of a list of resources, it
+/// sends browsers to the page.
 pub fn bounded(routes: Router, limits: Limits, access: Access) -> Router {
     let to_page = get(async || Redirect::temporary(PAGE));
     counted(routes.route("/", to_page).fallback(nothing_there), limits, Arc::default(), access)
@@ -111,7 +110,7 @@ fn routes() -> Routes<Arc<Service>> {
         .errors(&STORE)
 }
 
-/// Puts the limits around routes, and a problem as the body of every error.
+/// Wraps routes in the limits, with a problem as the body of every error.
 pub(super) fn counted(
     routes: Router,
     limits: Limits,
@@ -122,7 +121,7 @@ pub(super) fn counted(
     let shed = ServiceBuilder::new()
         .layer(HandleErrorLayer::new(|_: BoxError| std::future::ready(problem::busy())))
         .layer(LoadShedLayer::new())
-        // One count for all routes; the plain layer would give each route its own.
+        // One count for all routes; the plain layer would count each route.
         .layer(GlobalConcurrencyLimitLayer::new(limits.n_requests))
         .layer(RequestBodyLimitLayer::new(REQUEST_BODY_BYTES))
         .layer(timeout);

@@ -18,23 +18,23 @@ use tokio::sync::Semaphore;
 
 use crate::store::{Stamp, StoreError, StoreReader};
 
-/// Pause before a manifest that did not open is read again. The fault may lie in another file or pass by
-/// itself (no file descriptors left), so the manifest's own change is not the only sign.
+/// Pause before a manifest that failed to open is read again. The fault may lie in another file or pass by itself (no
+/// file descriptors left), so the manifest need not change.
 const RETRY_PAUSE: Duration = Duration::from_secs(10);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     pub connections: ConnectionLimits,
-    /// Requests in progress; further ones get 503.
+    /// Concurrent requests; more get 503.
     pub(crate) n_requests: usize,
-    /// Objects being sent; further ones get 503.
+    /// Objects sent concurrently; more get 503.
     pub(crate) n_downloads: usize,
     /// Time until an answer must begin, else 503.
     pub(crate) answer_timeout: Duration,
 }
 
 impl Default for Limits {
-    /// Returns bounds for a machine with a few cores: 64 downloads in pieces take 4 MiB.
+    /// For a machine with a few cores: 64 downloads in pieces take 4 MiB.
     fn default() -> Self {
         Self {
             connections: ConnectionLimits::default(),
@@ -49,9 +49,9 @@ pub(super) struct Snapshot {
     pub(super) reader: StoreReader,
     pub(super) manifest: Bytes,
     pub(super) index: CellIndex,
-    /// Lengths of the shards that may be fetched: those of the current manifest and of the one before.
+    /// Lengths of the shards of the current and the previous manifest.
     pub(super) objects: BTreeMap<Hash32, u64>,
-    /// The manifests by their names as targets: the current one and the one before.
+    /// Current and previous manifest by their target names.
     pub(super) targets: BTreeMap<String, Bytes>,
 }
 
@@ -78,7 +78,7 @@ impl Snapshot {
 }
 
 struct Failed {
-    /// `None`: the file was missing.
+    /// `None` if the file was missing.
     version: Option<Stamp>,
     at: Instant,
 }
@@ -86,7 +86,7 @@ struct Failed {
 pub(super) struct Service {
     dir: PathBuf,
     snapshot: RwLock<Arc<Snapshot>>,
-    /// The last manifest that did not open. Locked while a manifest is read, so that one request reads it.
+    /// Last manifest that failed to open. Locked while a manifest is read, so that only one request reads it.
     failed: Mutex<Option<Failed>>,
     n_reloads: AtomicU64,
     n_reload_failures: AtomicU64,
@@ -115,10 +115,9 @@ impl Service {
         Arc::clone(&self.snapshot.read().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Returns the published generation; blocks on a `stat`, and on reading where the manifest changed.
-    ///
-    /// A manifest that does not open leaves the current generation in place. It is logged once, and read
-    /// again when the file changes or after [`RETRY_PAUSE`].
+    /// Returns the published generation; blocks on a `stat`, and on reading a changed manifest. A manifest that fails
+    /// to open leaves the current generation; it is logged once, and read again when it changes or after
+    /// [`RETRY_PAUSE`].
     fn current(&self) -> Arc<Snapshot> {
         let snapshot = self.snapshot();
         if snapshot.reader.is_current() {
@@ -159,7 +158,7 @@ impl Service {
         }
     }
 
-    /// Runs file access and search off the asynchronous threads, on the published generation.
+    /// Runs blocking work on the published generation, off the asynchronous threads.
     pub(super) async fn with_current<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Snapshot) -> Result<T, Problem> + Send + 'static,

@@ -18,7 +18,7 @@ use super::*;
 use crate::store::tests::{manifest, manifest_of_boxes};
 use crate::store::{Extras, Store, StoreError, StoreReader};
 
-/// A store with generations 1 (shards 0 and 1) and 2 (shards 1 and 2), and the shards' bytes.
+/// A store with generations 1 (shards 0 and 1) and 2 (shards 1 and 2), and all shards' bytes.
 struct Fixture {
     dir: tempfile::TempDir,
     store: Store,
@@ -52,7 +52,7 @@ impl Fixture {
         self.shards[range].iter().map(|(hash, bytes)| (*hash, bytes.len() as u64)).collect()
     }
 
-    /// The manifest's name among the targets, as the metadata states it.
+    /// Target name of the manifest, from the metadata.
     fn manifest_sha256(&self) -> String {
         let targets = fs_err::read(self.dir.path().join("metadata/2.targets.json")).expect("there");
         let targets: Value = serde_json::from_slice(&targets).expect("JSON");
@@ -83,7 +83,7 @@ impl Answer {
         serde_json::from_slice(&self.body).expect("JSON")
     }
 
-    /// Checks that this is a problem of RFC 9457 and returns its detail.
+    /// Checks that this is a problem of RFC 9457; returns its detail.
     fn problem(&self, status: StatusCode) -> String {
         assert_eq!(self.status, status);
         assert_eq!(self.header(header::CONTENT_TYPE), "application/problem+json");
@@ -139,7 +139,7 @@ async fn manifest_is_tagged() {
 async fn objects_in_whole_and_in_part() {
     let fixture = fixture();
     let router = fixture.router();
-    // Shard 0 is listed by the manifest before the current one alone.
+    // Only the previous manifest lists shard 0.
     for (hash, bytes) in &fixture.shards {
         let answer = get_with(&router, &format!("/v1/objects/{hash}"), &[]).await;
         assert_eq!((answer.status, &answer.body[..]), (StatusCode::OK, &bytes[..]));
@@ -232,7 +232,6 @@ async fn cells_near_a_point() {
     let fixture = fixture();
     let origin = Geographic { latitude_deg: 46.842657, longitude_deg: -91.994008, height_m: 158.5 };
     let reference = GeoReference { origin };
-    // A spiral of boxes.
     let boxes: Vec<Aabb> = (0..60)
         .map(|i| {
             let (angle, i) = (f64::from(i) * 0.7, f64::from(i));
@@ -263,7 +262,7 @@ async fn cells_near_a_point() {
         assert_eq!(answer.status, StatusCode::OK, "{query}");
         let answer = answer.json();
         assert_eq!((&answer["generation"], &answer["encoder_id"]), (&4.into(), &"01".repeat(32).into()));
-        // Oracle: brute force over the boxes, the distance by clamping.
+        // Oracle: brute force over the boxes, with distances by clamping.
         let distance = |b: &Aabb| centre.clamp(b.min, b.max).distance(centre);
         let near = boxes.iter().enumerate().filter(|(_, b)| distance(b) <= 20.0);
         let expected: Vec<(u64, f64)> = near.map(|(i, b)| (i as u64, distance(b))).collect();
@@ -389,7 +388,7 @@ async fn overload_and_timeout_are_problems() {
     assert_eq!(late.header(header::RETRY_AFTER), "2");
 }
 
-/// A page alone has no list of resources, so nothing names one.
+/// A page alone has no list of resources, so nothing may name one.
 #[tokio::test]
 async fn a_page_alone_is_found_from_the_root() {
     let routes = Router::new().route("/view", get(async || "the page"));
@@ -422,7 +421,6 @@ async fn downloads_are_counted_until_they_end() {
     assert_eq!(get_with(&router, &path, &[]).await.status, StatusCode::OK);
 }
 
-/// A running service: its address, what stops it, and its end.
 struct Running {
     address: SocketAddr,
     stop: tokio::sync::oneshot::Sender<()>,

@@ -11,24 +11,23 @@ use super::shader::{Counter, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZE};
 
 pub(crate) const COUNTERS_BYTES: u64 = 64;
 
-/// Size of the parameters of a band, with room to spare, bytes.
+/// Bytes for a band's parameters, with room to spare.
 pub(crate) const VIEW_BYTES: u64 = 256;
 
 pub(crate) const REGION_BYTES: u64 = REGION_BITS as u64 / 8;
 
-/// Returns the size of the regions of so many pixels, in whole words, bytes.
+/// Bytes of the regions of `n_px` pixels, in whole words.
 pub(crate) fn regions_bytes(n_px: usize) -> u64 {
     (n_px as u64 * REGION_BYTES).next_multiple_of(4)
 }
 
-/// Sizes for which buffers are created.
 #[derive(Clone, Copy)]
 pub struct Size {
     pub(crate) capacities: Capacities,
     pub(crate) n_tiles: u32,
-    /// Pixels of a band.
+    /// Of a band.
     pub n_px: u32,
-    /// Gaussians of the largest chunk.
+    /// Of the largest chunk.
     pub(crate) n_chunk: u32,
 }
 
@@ -54,7 +53,7 @@ pub struct Buffers {
 }
 
 impl Buffers {
-    /// Creates the buffers; `None` if the device memory does not suffice.
+    /// `None` if the device memory does not suffice.
     pub fn new(device: &Device, size: Size) -> Option<Self> {
         let Size { capacities, n_tiles, n_px, n_chunk } = size;
         let storage = |label: &str, words: u64| {

@@ -32,11 +32,11 @@ pub struct Adapter {
     adapter: wgpu::Adapter,
 }
 
-/// Returns all adapters, the best kind first.
+/// Best kind first.
 pub fn adapters() -> Vec<Adapter> {
     let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
     descriptor.backends = wgpu::Backends::PRIMARY;
-    // Our own shaders compute the dispatch sizes, within limits; validating them again would cost a pass each.
+    // Our shaders compute dispatch sizes within limits; validating them again would cost a pass each.
     descriptor.flags = wgpu::InstanceFlags::empty();
     let instance = wgpu::Instance::new(descriptor);
     let mut adapters: Vec<Adapter> = block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY))
@@ -49,19 +49,18 @@ pub fn adapters() -> Vec<Adapter> {
     adapters
 }
 
-/// An opened device with compiled shaders.
 pub struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     pub(super) kernels: Kernels,
-    /// Its description, with the precision in use.
+    /// With the precision in use.
     pub report: AdapterReport,
-    /// The first error; after it, the device is not used any more.
+    /// First error; after it the device is no longer used.
     failure: Arc<Mutex<Option<String>>>,
 }
 
 impl Adapter {
-    /// Opens the device and compiles the shaders. `precision` may be lower than that of the device.
+    /// `precision` may be lower than the device's.
     pub fn open(&self, precision: Precision) -> Result<Device, RasterError> {
         let failed = |what: String| RasterError::Device { adapter: self.report.name.clone(), what };
         let limits = self.adapter.limits();
@@ -108,7 +107,6 @@ impl Adapter {
 }
 
 impl Device {
-    /// Returns the first error since the device was opened.
     pub(super) fn check(&self) -> Result<(), RasterError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),
@@ -124,7 +122,7 @@ impl Device {
         RasterError::DeviceCapacity { adapter: self.report.name.clone(), what }
     }
 
-    /// Creates a buffer, mapped if the host writes it; `None` if the device memory does not suffice.
+    /// Mapped if the host writes it; `None` if the device memory does not suffice.
     pub(super) fn buffer(
         &self,
         label: &str,
@@ -145,12 +143,12 @@ impl Device {
     pub(super) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), RasterError> {
         let wait = wgpu::PollType::Wait { submission_index: Some(submission), timeout: None };
         let polled = self.device.poll(wait);
-        // The cause of a failure is more informative than the failure of the wait.
+        // The failure's cause is more informative than that of the wait.
         self.check()?;
         polled.map_err(|e| self.error(e.to_string())).map(drop)
     }
 
-    /// Makes the device fail like a lost device, for tests.
+    /// Fails like a lost device, for tests.
     #[doc(hidden)]
     pub fn lose(&self) {
         self.device.destroy();

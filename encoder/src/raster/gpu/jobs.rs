@@ -6,7 +6,7 @@ use super::device::Device;
 use super::layout::{Capacities, ScanJob, SortPass, screen_layout};
 use super::shader::{Counter, NONE, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZE};
 
-/// Distance between records, bytes; bindings must be aligned.
+/// Bytes between records; bindings must be aligned.
 pub(crate) const JOB_STRIDE_BYTES: u64 = 256;
 pub(crate) const DISPATCH_BYTES: u64 = 16;
 pub(crate) const PAIR_WORDS: u32 = 2;
@@ -16,14 +16,13 @@ pub(crate) const ENTRY_WORDS: u32 = 4;
 pub enum Scan {
     Digits(Counter),
     Pairs,
-    /// Computes dispatch sizes only; there is no array.
+    /// Only dispatch sizes; there is no array.
     Entries,
     Heads,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) enum SortKey {
-    /// Depth of a visible Gaussian.
     Depth,
     Tile,
     /// Visible Gaussian of an entry, then its region.
@@ -43,8 +42,8 @@ impl SortKey {
     }
 }
 
-/// Returns the least key of a depth, and how many bits keys have once it is subtracted. A key is the bits of a
-/// float between the near and the far plane: positive floats and their bits have the same order.
+/// Least key of a depth, and the bits of keys after subtracting it. A key is the bits of a float between near and far
+/// plane: positive floats and their bits have the same order.
 pub(crate) fn depth_keys() -> (u32, u32) {
     let [least, most] = [NEAR_Z, FAR_Z].map(|z| (z as f32).to_bits());
     (least, bits_of(most - least + 1))
@@ -69,8 +68,7 @@ pub(crate) fn sort_job(key: SortKey, pass: u32) -> u64 {
     SCAN_JOBS + key as u64 * u64::from(MAX_PASSES) + u64::from(pass)
 }
 
-/// Returns the offset of the dispatch sizes for the items of a counter: one thread per item, or one workgroup per
-/// sort block.
+/// Offset of the dispatch sizes for a counter's items: one thread per item, or one workgroup per sort block.
 pub(crate) fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
     (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
 }
@@ -87,7 +85,7 @@ pub fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
     }
 }
 
-/// Writes the records of all scans, and of the sorts by depth and tile, for the given capacities.
+/// Writes the records of all scans, and of the sorts by depth and tile.
 pub(crate) fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) {
     let write = |index: u64, bytes: &[u8]| {
         device.queue.write_buffer(jobs, index * JOB_STRIDE_BYTES, bytes);
@@ -118,7 +116,7 @@ pub(crate) fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capac
     write_sort_jobs(device, jobs, capacities, (SortKey::Tile, 0));
 }
 
-/// Writes the records of the passes of a sort. `low_bits` of the key lie in its second word; 0 if it has one word.
+/// `low_bits` of the key lie in its second word; 0 if it has one word.
 pub(crate) fn write_sort_jobs(
     device: &Device,
     jobs: &wgpu::Buffer,

@@ -14,9 +14,9 @@ use crate::raster::rasterizer::RegionWeight;
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct SceneGaussian {
-    /// Mean relative to the scene's origin, rounded to `f32`.
+    /// Relative to the scene's origin, rounded to `f32`.
     pub(crate) mean_high: [f32; 3],
-    /// Opacity; 0 if the Gaussian cannot be drawn.
+    /// 0 if the Gaussian cannot be drawn.
     pub opacity: f32,
     /// Rounding error of `mean_high`.
     pub(crate) mean_low: [f32; 3],
@@ -60,7 +60,6 @@ fn high_and_low(value: DVec3) -> ([f32; 3], [f32; 3]) {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct Chunk {
-    /// Index of its first Gaussian in the scene.
     pub(crate) first_gaussian: u32,
     pub n_gaussians: u32,
 }
@@ -70,7 +69,7 @@ pub(crate) struct Chunk {
 #[repr(C)]
 pub(crate) struct ScanJob {
     pub items: u32,
-    /// Upper limit of the number of items; the number itself if there is no counter.
+    /// Upper limit of the number of items; exact without a counter.
     pub(crate) n_most: u32,
     pub block: u32,
     /// Values per block.
@@ -89,23 +88,22 @@ pub(crate) struct SortPass {
     pub offset: u32,
     /// Subtracted from each word at `offset`.
     pub least: u32,
-    /// Bits of the key that come from the word after that at `offset`, the lower ones.
+    /// Lower bits of the key, which come from the word after `offset`.
     pub(crate) low_bits: u32,
-    /// Position of the digit, bits.
+    /// In bits.
     pub shift: u32,
     pub capacity: u32,
 }
 
-/// A contribution summed over all tiles of a band, in units of `2^-SUM_FRACTION_BITS`.
+/// Summed over all tiles of a band, in units of `2^-SUM_FRACTION_BITS`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct RegionSum {
-    /// Index in the scene.
     pub gaussian: u32,
     pub region: u32,
-    /// Lower word of the sum.
+    /// Lower word.
     pub low: u32,
-    /// Upper word of the sum.
+    /// Upper word.
     pub high: u32,
 }
 
@@ -131,7 +129,7 @@ pub(crate) struct Background {
 pub(crate) struct Capacities {
     pub visible: u32,
     pub pairs: u32,
-    /// Contributions per tile, Gaussian and region.
+    /// Per tile, Gaussian and region.
     pub entries: u32,
 }
 
@@ -146,8 +144,7 @@ impl Capacities {
         needed.visible <= self.visible && needed.pairs <= self.pairs && needed.entries <= self.entries
     }
 
-    /// Returns larger ones where more was needed, by a quarter more than that: an overflow truncates the counts of
-    /// later stages.
+    /// Adds a quarter to what was needed where it was too little: an overflow truncates the counts of later stages.
     pub(crate) fn grown(&self, needed: &Self, max: &Self) -> Self {
         let grown = |needed: u32, now: u32, max: u32| {
             if needed > now { needed.saturating_add(needed / 4).min(max) } else { now }
@@ -168,8 +165,7 @@ pub(crate) struct ViewBlock {
 }
 
 impl ViewBlock {
-    /// Prepares the band of a view with these rows of tiles; `origin_in_world` is the origin of the means on the
-    /// device.
+    /// A band of a view with these rows of tiles; `origin_in_world` is the means' origin on the device.
     pub fn new(
         view: &RasterView,
         origin_in_world: DVec3,
@@ -214,7 +210,7 @@ impl ViewBlock {
     }
 }
 
-/// Returns the size of a Gaussian on the screen in bytes, and the index of its depth word.
+/// Bytes of a Gaussian on the screen, and the index of its depth word.
 pub(crate) fn screen_layout(precision: Precision) -> (u32, u32) {
     match precision {
         Precision::F64 => (56, 10),
@@ -229,7 +225,7 @@ mod tests {
     use super::*;
     use crate::raster::gpu::shader::module_text;
 
-    /// Returns the members (name, offset, size) and the total size of a structure in a shader.
+    /// Members (name, offset, size) and total size of a structure in a shader.
     fn layout_of(stage: &str, name: &str, precision: Precision) -> (Vec<(String, usize, usize)>, usize) {
         let module = naga::front::wgsl::parse_str(&module_text(stage, precision)).expect("parses");
         let context = module.to_ctx();

@@ -1,11 +1,10 @@
 //! The GPU backend, on wgpu (Vulkan, Metal, DX12).
 //!
-//! The stages are those of the CPU; each shader has the name of its CPU twin. The result is the sorted sparse list
-//! of contributions. Contributions are integers and every order comes from a stable sort, so a device gives the
-//! same bits each time.
+//! The stages are those of the CPU; each shader has the name of its CPU twin. The result is the sorted sparse list of
+//! contributions: integers in the order of stable sorts, so a device gives the same bits each time.
 //!
-//! Data beyond the limit of a binding is divided: the scene into chunks, the image into bands of tile rows. This
-//! changes no contribution, because tiles are independent and integers add up exactly.
+//! Data beyond a binding's limit is divided: the scene into chunks, the image into bands of tile rows. This changes no
+//! contribution, because tiles are independent and integers add up exactly.
 
 mod buffers;
 mod device;
@@ -52,7 +51,7 @@ impl GpuRasterizer {
         &self.device.report
     }
 
-    /// Makes the device fail like a lost device, for tests.
+    /// Fails like a lost device, for tests.
     #[doc(hidden)]
     pub fn lose(&self) {
         self.device.lose();
@@ -75,7 +74,7 @@ struct GpuScene<'s> {
     device: Arc<Device>,
     scene: &'s Gaussians,
     max_binding_bytes: u64,
-    /// Centre of the scene; means relative to it need fewer digits.
+    /// Means relative to the scene's centre need fewer digits.
     origin_in_world: DVec3,
     n_unusable: usize,
     chunks: Vec<SceneChunk>,
@@ -86,9 +85,9 @@ struct GpuScene<'s> {
 struct Pool {
     idle: Vec<Workspace>,
     n_made: usize,
-    /// Workspaces that may be made; fewer once the device's memory did not suffice.
+    /// Most workspaces; fewer once the device's memory did not suffice.
     n_most: usize,
-    /// Capacities of new workspaces: the largest that any view has needed so far.
+    /// For new workspaces: the largest that any view has needed so far.
     capacities: Capacities,
 }
 
@@ -140,12 +139,12 @@ impl<'s> GpuScene<'s> {
         Ok(loaded)
     }
 
-    /// Copies Gaussians to the device; `None` if its memory does not suffice.
+    /// `None` if the device's memory does not suffice.
     fn upload(&self, first: usize, n: usize) -> Option<wgpu::Buffer> {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
         let buffer = self.device.buffer("Gaussians", n as u64 * SCENE_GAUSSIAN_BYTES, usage)?;
-        // Uploads in pieces and waits for each. So the host duplicates little of the scene, and the host-visible
-        // memory of the device, which may be only 256 MiB, suffices.
+        // Uploads pieces and waits for each, so that the host duplicates little of the scene, and the device's
+        // host-visible memory, which may be only 256 MiB, suffices.
         const PIECE: usize = 1 << 18;
         for start in (0..n).step_by(PIECE) {
             let rows: Vec<SceneGaussian> = (start..(start + PIECE).min(n))
@@ -159,12 +158,10 @@ impl<'s> GpuScene<'s> {
         Some(buffer)
     }
 
-    /// Returns the largest number of elements of this size in one binding.
     fn max_elements(&self, bytes: u64) -> u32 {
         (self.max_binding_bytes / bytes).min(u64::from(MAX_CAPACITY)) as u32
     }
 
-    /// Returns the largest capacities that bindings allow.
     fn max_capacities(&self) -> Capacities {
         let (screen_bytes, _) = screen_layout(self.device.report.precision);
         Capacities {
@@ -201,7 +198,7 @@ impl<'s> GpuScene<'s> {
         self.returned.notify_one();
     }
 
-    /// Gives up the place of a workspace for which there was no memory, unless it is the only one.
+    /// Gives up a workspace that did not fit the memory, unless it is the only one.
     fn give_up_workspace(&self) -> bool {
         let mut pool = self.pool();
         let is_one_of_several = pool.n_made > 1;
@@ -223,8 +220,8 @@ impl<'s> GpuScene<'s> {
             .ok_or_else(|| self.device.capacity_error(format!("out of memory for {capacities:?}")))
     }
 
-    /// Processes a view band by band. `work` processes one band in a workspace and returns its counts. If a count
-    /// exceeds its capacity, the band is repeated with larger capacities, or in two halves.
+    /// Processes a view band by band. `work` does a band in a workspace and returns its counts. If a count exceeds its
+    /// capacity, the band is repeated with larger capacities, or in two halves.
     fn each_band(
         &self,
         view: &RasterView,
@@ -235,8 +232,7 @@ impl<'s> GpuScene<'s> {
         self.bands_of(&mut lent.workspace, view, px_bytes, &mut work)
     }
 
-    /// Takes a workspace that holds a band, or makes one; `None` where memory does not suffice and there is another
-    /// view's to try with instead.
+    /// Takes a workspace for a band, or makes one; `None` if memory does not suffice but another view's may be tried.
     fn workspace_for(
         &self,
         workspace: &mut Option<Workspace>,
@@ -268,7 +264,7 @@ impl<'s> GpuScene<'s> {
         let tile = TILE_SIZE_PX as u32;
         let (width_px, height_px) = (view.intrinsics.width_px, view.intrinsics.height_px);
         let max = self.max_capacities();
-        // First divides the image by pixels; bands with too much content are divided again below.
+        // By pixels first; bands with too much content are divided again below.
         let rows_of_band = (self.max_elements(px_bytes) / width_px / tile).clamp(1, MAX_DISPATCH);
         let n_rows = height_px.div_ceil(tile);
         let mut bands: Vec<[u32; 2]> = (0..n_rows.div_ceil(rows_of_band))
@@ -335,8 +331,8 @@ impl<'s> GpuScene<'s> {
     }
 }
 
-/// Returns a robust centre of a scene: the median of a sample along each axis, rounded to the scale of the scene
-/// so that most differences to it are exact.
+/// A robust centre of a scene: the median of a sample along each axis, rounded to the scene's scale so that most
+/// differences to it are exact.
 fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     const N_SAMPLES: usize = 4096;
     let sample: Vec<DVec3> = (0..scene.len())
@@ -355,7 +351,7 @@ fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     }))
 }
 
-/// A workspace, or its place, that goes back whatever becomes of the view; a panic may have left it half used.
+/// A workspace, or its place, that goes back in any case; after a panic it may be half used.
 struct LentWorkspace<'a, 's> {
     scene: &'a GpuScene<'s>,
     workspace: Option<Workspace>,
@@ -368,14 +364,13 @@ impl Drop for LentWorkspace<'_, '_> {
     }
 }
 
-/// The pixels of a band.
 struct Rows {
-    /// Row-major range within the image.
+    /// Row-major within the image.
     px: Range<usize>,
     is_whole: bool,
 }
 
-/// Largest number of regions in a view; the next number stands for "no region".
+/// Most regions in a view; the next number stands for "no region".
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
 impl LoadedScene for GpuScene<'_> {
@@ -439,7 +434,7 @@ impl LoadedScene for GpuScene<'_> {
 mod tests {
     use super::*;
 
-    /// A panic in one view gives its place to the next one, which would wait for ever otherwise.
+    /// A panic in one view gives its place to the next, which would wait for ever otherwise.
     #[test]
     fn a_panic_gives_its_place_back() {
         let Some(adapter) = adapters().into_iter().next() else {
@@ -461,8 +456,7 @@ mod tests {
         assert_eq!(scene.pool().idle.len(), 1);
     }
 
-    /// Three views, and memory for one of them: the places of two are given up, the last one is kept, and none is
-    /// made anew.
+    /// Three views and memory for one: the places of two are given up, and none is made anew.
     #[test]
     fn fewer_views_are_in_flight_where_memory_does_not_suffice() {
         let Some(adapter) = adapters().into_iter().next() else {

@@ -11,41 +11,40 @@ use slag_raster::{EXP_OF_MINUS_C, MAX_POWER};
 
 use crate::raster::adapter::Precision;
 
-/// Threads of a workgroup, equal to the pixels of a tile.
+/// Equal to the pixels of a tile.
 pub(crate) const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
 /// Items that a workgroup sorts at once.
 pub(crate) const SORT_BLOCK: u32 = 2048;
 /// Digits of a sort pass.
 pub(crate) const RADIX: u32 = 32;
-/// Largest number of workgroups of a dispatch that every device supports.
+/// Most workgroups of a dispatch that every device supports.
 pub(crate) const MAX_DISPATCH: u32 = 65_535;
-/// Fraction bits of fixed-point weights; with the 2^28 pixels of the largest image, sums need 63 bits.
+/// Of fixed-point weights; with the 2^28 pixels of the largest image, sums need 63 bits.
 pub const SUM_FRACTION_BITS: u32 = 35;
 /// Bits of a region number: two share a word, and so do a region and a pixel of its tile.
 pub(crate) const REGION_BITS: u32 = 16;
-/// Most items of a buffer: counts above it do not fit, and stay far below 2^32.
+/// Most items of a buffer: larger counts do not fit, and stay far below 2^32.
 pub(crate) const MAX_CAPACITY: u32 = 1 << 31;
 pub const NONE: u32 = u32::MAX;
 
-/// Counters that shaders increment; the host reads them after each band.
+/// Incremented by shaders; the host reads them after each band.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(crate) enum Counter {
     Visible,
-    /// Visible Gaussians that were not visible in an earlier band.
+    /// Visible Gaussians that no earlier band has shown.
     FirstVisible,
     /// Gaussians with a projection out of range.
     Unrepresentable,
-    /// (Tile, Gaussian) pairs of the band.
     Pairs,
-    /// Contributions per tile, Gaussian and region.
+    /// Per tile, Gaussian and region.
     Entries,
-    /// Contributions per Gaussian and region.
+    /// Per Gaussian and region.
     RegionSums,
 }
 
 impl Counter {
-    /// All counters with their names in the shaders, by value.
+    /// All counters by value, with their names in the shaders.
     pub const ALL: [(Self, &'static str); 6] = [
         (Self::Visible, "VISIBLE"),
         (Self::FirstVisible, "FIRST_VISIBLE"),
@@ -56,10 +55,9 @@ impl Counter {
     ];
 }
 
-/// The values of all counters after a band.
 pub(crate) type Counts = [u32; Counter::ALL.len()];
 
-/// The shaders of the stages, without the common part.
+/// Without the common part.
 pub(crate) const STAGES: [(&str, &str); 7] = [
     ("project", include_str!("../project.wgsl")),
     ("scan", include_str!("../scan.wgsl")),
@@ -71,7 +69,6 @@ pub(crate) const STAGES: [(&str, &str); 7] = [
 ];
 const COMMON: &str = include_str!("../common.wgsl");
 
-/// Returns the complete source of a stage.
 pub(crate) fn module_text(stage: &str, precision: Precision) -> String {
     let mut text = String::new();
     let real = match precision {
@@ -128,8 +125,7 @@ pub(crate) fn module_text(stage: &str, precision: Precision) -> String {
     text
 }
 
-/// Returns the source of the exponential function: Horner's scheme unrolled, because an array of constants would be
-/// indexed in memory.
+/// Horner's scheme unrolled, because an array of constants would be indexed in memory.
 fn exp_of_minus() -> String {
     let mut text = String::new();
     let [first @ .., last] = EXP_OF_MINUS_C;
@@ -143,7 +139,6 @@ fn exp_of_minus() -> String {
     text
 }
 
-/// The compute pipelines of all stages.
 pub(crate) struct Kernels {
     pub(crate) count_visible: wgpu::ComputePipeline,
     pub(crate) write_visible: wgpu::ComputePipeline,
@@ -212,7 +207,7 @@ impl Kernels {
 mod tests {
     use super::*;
 
-    /// Every loop is one over a variable that grows by a constant, or by a number that cannot be zero.
+    /// Every loop runs over a variable that grows by a constant, or by a number that cannot be zero.
     #[test]
     fn loops_count_up() {
         let steps = ["++", "+= 1u", "*= 2u", "/= 2u", "+= STEP", "+= LOAD", "+= WORKGROUP_SIZE"];

@@ -74,7 +74,7 @@ impl Stages {
         dispatch(pass, &device.kernels.scan, group, [1, 1]);
     }
 
-    /// Sorts by a key with so many bits. Returns the index of the buffer with the order.
+    /// Sorts by a key of `bits` bits; returns the index of the buffer with the order.
     pub fn sort(
         &mut self,
         device: &Device,
@@ -114,7 +114,6 @@ impl Stages {
         n_passes as usize % 2
     }
 
-    /// Lists the (tile, Gaussian) pairs of the visible Gaussians.
     pub fn pair(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, depth_order: usize) {
         let offset = dispatch_offset(Counter::Visible, false);
         let order = &self.buffers.visible_order[depth_order];
@@ -139,7 +138,6 @@ impl Stages {
         dispatch_indirect(pass, &kernels.write_pairs, &group, (&self.buffers.dispatches, offset));
     }
 
-    /// Finds the range of each tile in the sorted pairs.
     pub(crate) fn find_ranges(
         &mut self,
         device: &Device,
@@ -173,7 +171,6 @@ impl Stages {
         dispatch(pass, kernel, group, [1, 1]);
     }
 
-    /// Blends all tiles and sums their weights over regions.
     pub(crate) fn blend(
         &mut self,
         device: &Device,
@@ -197,7 +194,6 @@ impl Stages {
         self.scan(device, pass, Scan::Entries);
     }
 
-    /// Sums the sorted entries of each (Gaussian, region).
     pub fn compact(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, entry_order: usize) {
         let order = &self.buffers.entry_order[entry_order];
         let bound = [
@@ -227,7 +223,6 @@ pub fn whole(buffer: &wgpu::Buffer) -> wgpu::BufferBinding<'_> {
     buffer.as_entire_buffer_binding()
 }
 
-/// Numbers bindings from 0 on.
 pub fn number<'a>(bindings: &[wgpu::BufferBinding<'a>]) -> Vec<(u32, wgpu::BufferBinding<'a>)> {
     (0..).zip(bindings.iter().cloned()).collect()
 }
@@ -251,7 +246,7 @@ pub fn bind(
     })
 }
 
-/// Returns the bind group with this name and number, and creates it at the first use.
+/// Returns the bind group of this name and number, creating it on first use.
 pub(crate) fn cached<'g>(
     groups: &'g mut HashMap<(&'static str, u32), wgpu::BindGroup>,
     key: (&'static str, u32),
@@ -260,7 +255,7 @@ pub(crate) fn cached<'g>(
     groups.entry(key).or_insert_with(make)
 }
 
-/// Records a kernel with `n` workgroups along x and y.
+/// `n` workgroups, along x and y.
 pub(crate) fn dispatch(
     pass: &mut wgpu::ComputePass<'_>,
     kernel: &wgpu::ComputePipeline,
@@ -272,7 +267,7 @@ pub(crate) fn dispatch(
     pass.dispatch_workgroups(n[0], n[1], 1);
 }
 
-/// Records a kernel with the number of workgroups from a buffer.
+/// With the number of workgroups from a buffer.
 pub(crate) fn dispatch_indirect(
     pass: &mut wgpu::ComputePass<'_>,
     kernel: &wgpu::ComputePipeline,
@@ -290,12 +285,12 @@ pub(crate) struct SceneChunk {
     pub n_gaussians: u32,
     /// The [`Chunk`] and the [`ScanJob`] of its blocks, [`JOB_STRIDE_BYTES`] apart.
     pub jobs: wgpu::Buffer,
-    /// The Gaussians; `None` if they are uploaded for each view.
+    /// `None` if they are uploaded for each view.
     pub gaussians: Option<wgpu::Buffer>,
 }
 
 impl SceneChunk {
-    /// Creates the buffers of a chunk without its Gaussians; `None` if the memory does not suffice.
+    /// Without the Gaussians; `None` if the memory does not suffice.
     pub fn new(device: &Device, first_gaussian: u32, n_gaussians: u32) -> Option<Self> {
         let jobs = device.buffer("chunk jobs", 2 * JOB_STRIDE_BYTES, Usage::STORAGE | Usage::COPY_DST)?;
         let chunk = Chunk { first_gaussian, n_gaussians };

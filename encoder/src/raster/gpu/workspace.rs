@@ -12,26 +12,24 @@ use super::shader::{Counter, Counts};
 use super::stages::{SceneChunk, Stages, bind, dispatch, number, whole};
 use crate::raster::rasterizer::RasterError;
 
-/// Size of a drawn pixel, bytes.
 pub(crate) const PIXEL_BYTES: u64 = 20;
 
-/// The resources of one view in flight.
 pub struct Workspace {
     pub(crate) capacities: Capacities,
     n_tiles: u32,
     n_px: u32,
     stages: Stages,
-    /// What the host gives to a band: its view, then its regions. Mapped between bands.
+    /// A band's view, then its regions. Mapped between bands.
     uploads: wgpu::Buffer,
     staging: wgpu::Buffer,
     /// Contributions that are copied back together with the counters.
     n_copied: u32,
-    /// Bits of a region in the records of the entries' sort.
+    /// Bits of a region in the entries' sort records.
     region_bits: u32,
 }
 
 impl Workspace {
-    /// Creates a workspace; `None` if the device memory does not suffice.
+    /// `None` if the device memory does not suffice.
     pub fn new(device: &Device, size: Size) -> Option<Self> {
         let Size { capacities, n_tiles, n_px, .. } = size;
         let uploads_bytes = VIEW_BYTES + regions_bytes(n_px as usize);
@@ -57,8 +55,8 @@ impl Workspace {
         n_tiles <= self.n_tiles && n_px <= self.n_px
     }
 
-    /// Runs all stages on a band and returns its counts. `take` is called once with the contributions, unless a
-    /// count exceeds its capacity, which makes them incomplete.
+    /// Runs all stages on a band and returns its counts. `take` gets the contributions once, unless a count exceeds its
+    /// capacity and makes them incomplete.
     pub fn contributions(
         &mut self,
         band: &Band<'_>,
@@ -86,7 +84,7 @@ impl Workspace {
         if !self.fits(&counts) || n_contributions <= self.n_copied {
             return Ok(counts);
         }
-        // More than expected: copies again, with a larger staging buffer for this and later views.
+        // More than expected: copies again, with a larger staging buffer from now on.
         self.n_copied = n_contributions.saturating_add(n_contributions / 4).min(self.capacities.entries);
         self.staging = Self::staging(device, self.n_copied)
             .ok_or_else(|| device.capacity_error("out of memory for the copy back".into()))?;
@@ -96,7 +94,7 @@ impl Workspace {
         self.read_back(device, submission, take)
     }
 
-    /// Writes the records of the entries' sort, unless those there are for as many bits.
+    /// Writes the entries' sort records, unless they are for as many bits.
     fn set_region_bits(&mut self, device: &Device, region_bits: u32) {
         if self.region_bits != region_bits {
             self.region_bits = region_bits;
@@ -150,7 +148,6 @@ impl Workspace {
         Ok((counts, bytemuck::cast_slice(rest).to_vec()))
     }
 
-    /// Records the upload of a band's view and regions.
     fn upload(
         &self,
         encoder: &mut wgpu::CommandEncoder,
@@ -160,7 +157,7 @@ impl Workspace {
         let device = band.device;
         let mut bytes = band.view.to_bytes(device.report.precision);
         bytes.resize(VIEW_BYTES as usize, 0);
-        // Two a word: `NO_REGION` stays the largest number.
+        // Two per word; `NO_REGION` stays the largest number.
         bytes.extend(regions.iter().flat_map(|region| (*region as u16).to_le_bytes()));
         bytes.resize((VIEW_BYTES + regions_bytes(regions.len())) as usize, 0);
         let mut mapped = self
@@ -177,7 +174,7 @@ impl Workspace {
         Ok(())
     }
 
-    /// Records the stages up to the list of Gaussians of each tile.
+    /// Records the stages up to each tile's list of Gaussians.
     fn bin(&mut self, band: &Band<'_>, regions: &[u32]) -> Result<wgpu::CommandEncoder, RasterError> {
         let Band { device, chunks, upload, .. } = *band;
         let mut encoder = device.device.create_command_encoder(&Default::default());
@@ -210,7 +207,6 @@ impl Workspace {
         Ok(encoder)
     }
 
-    /// Returns whether the counts of a band are within the capacities.
     fn fits(&self, counts: &Counts) -> bool {
         self.capacities.hold(&Capacities::needed(counts))
     }
@@ -263,7 +259,6 @@ impl Workspace {
 pub(crate) struct Band<'a> {
     pub device: &'a Device,
     pub chunks: &'a [SceneChunk],
-    /// Uploads the Gaussians of a chunk that is not on the device.
     pub(crate) upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
     pub view: &'a ViewBlock,
 }
@@ -287,7 +282,7 @@ mod tests {
     use crate::raster::gpu::device::adapters;
     use crate::raster::gpu::jobs::Scan;
 
-    /// Opens the first GPU; `None` without one.
+    /// First GPU; `None` without one.
     fn opened(capacities: Capacities) -> Option<(Device, Workspace)> {
         let Some(adapter) = adapters().into_iter().next() else {
             println!("skipped: no GPU");
@@ -299,7 +294,6 @@ mod tests {
         Some((device, workspace))
     }
 
-    /// Submits the recorded commands and reads the start of a buffer.
     fn read_back(
         device: &Device,
         mut recorded: wgpu::CommandEncoder,
@@ -316,7 +310,7 @@ mod tests {
         bytemuck::cast_slice::<u8, u32>(&bytes)[..(len_bytes / 4) as usize].to_vec()
     }
 
-    /// 40 blocks of 2^27 pairs each, more than 2^32: the total stays at the largest number, which no buffer holds.
+    /// 40 blocks of 2^27 pairs exceed 2^32: the total saturates at the largest number, which no buffer holds.
     #[test]
     fn counts_that_would_wrap_stay_at_the_largest() {
         let Some((device, mut workspace)) = opened(Capacities { visible: 10_000, pairs: 1, entries: 1 })
@@ -339,8 +333,8 @@ mod tests {
         }
     }
 
-    /// Sorts entries by (member, region) on the device and on the host, at sizes around those of a workgroup and
-    /// of a block. Half of the keys repeat, which reveals an unstable sort.
+    /// Sorts by (member, region) on device and host, at sizes around a workgroup's and a block's. Half of the keys
+    /// repeat, which reveals an unstable sort.
     #[test]
     fn the_sort_is_stable_at_every_size() {
         let Some((device, mut workspace)) = opened(Capacities { visible: 1, pairs: 1, entries: 70_000 })

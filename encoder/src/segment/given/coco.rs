@@ -13,7 +13,7 @@ use crate::masks::rle::{Rle, RleError};
 use crate::masks::{Bits, BoxPx, Mask, NO_REGION};
 use crate::segment::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput};
 
-/// Masks of each image by file name, with their indices in the file.
+/// By file name, with indices in the file.
 pub(super) type MasksOfImage = BTreeMap<String, Vec<(usize, Rle)>>;
 
 #[derive(Deserialize)]
@@ -50,12 +50,12 @@ struct DataSetImage {
     file_name: String,
 }
 
-/// Reads the run-length masks of one photo, with their indices in the file.
+/// The masks of one photo, with their indices in the file.
 pub(super) fn read_list(path: &Path) -> Result<Vec<(usize, Rle)>, SegmentError> {
     rles_of(path, parse(path)?.annotations)
 }
 
-/// Parses a list of masks, or an object with a list as `annotations`.
+/// A list of masks, or an object with a list as `annotations`.
 fn parse(path: &Path) -> Result<MaskFile, SegmentError> {
     let mut bytes = Vec::new();
     files::open(path)?.read_to_end(&mut bytes)?;
@@ -89,7 +89,6 @@ fn rle_of(segmentation: Segmentation) -> Result<Rle, RleError> {
     }
 }
 
-/// Reads a data set: the masks of each image by file name.
 pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     let MaskFile { images, annotations } = parse(path)?;
     let image_ids: Vec<Option<u64>> = annotations.iter().map(|annotation| annotation.image_id).collect();
@@ -119,9 +118,8 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     Ok(named)
 }
 
-/// Returns the entry of a photo, with its name: the one of the photo's name; or else the one whose name is an ending of
-/// the photo's, or the other way round, at a folder; or else the one with the name that Roboflow makes of it,
-/// `NAME_jpg.rf.HASH.jpg`.
+/// Entry of a photo: the one of its name; or else the one whose name is an ending of it, or the other way round, at a
+/// folder; or else the one with Roboflow's name for it, `NAME_jpg.rf.HASH.jpg`.
 pub(super) fn entry<'a>(
     masks_of_image: &'a MasksOfImage,
     name: &str,
@@ -140,7 +138,6 @@ pub(super) fn entry<'a>(
         .or_else(|| one(&|entry| entry.rsplit('/').next().is_some_and(|entry| entry.starts_with(&exported))))
 }
 
-/// Decodes run-length masks and undistorts them like the photo.
 pub(super) fn masks_of_rles(
     path: &Path,
     rles: &[(usize, Rle)],
@@ -161,10 +158,8 @@ pub(super) fn masks_of_rles(
     })
 }
 
-/// Maps masks to the undistorted photo; masks outside it are dropped.
-///
-/// Each pixel looks up its source once for all masks: the partition of the masks is mapped as one label image, and
-/// each mask is reassembled from its regions.
+/// Maps masks to the undistorted photo; masks outside it are dropped. Each pixel is looked up once for all masks: their
+/// partition is mapped as one label image, and each mask is reassembled from its regions.
 pub(super) fn undistorted(
     masks: &[Mask],
     undistorter: &Undistorter,
@@ -221,7 +216,6 @@ pub(super) fn too_large(path: &Path) -> SegmentError {
     SegmentError::TooLarge { path: path.to_owned(), limit_bytes: MAX_MASK_BYTES }
 }
 
-/// Checks that masks have the size of the photo.
 pub(super) fn check_size(
     path: &Path,
     [width, height]: [u32; 2],

@@ -8,15 +8,15 @@ use slag_common::files;
 use super::coco::check_size;
 use crate::segment::segmenter::{SegmentError, SegmentInput};
 
-/// Memory that the PNG decoder may use beyond the pixels.
+/// Memory for the PNG decoder beside the pixels.
 const PNG_OVERHEAD_BYTES: usize = 1 << 20;
 
-/// Values between black and white in an image of one mask with soft edges, at least.
+/// Least number of values between black and white in a single mask with soft edges.
 const MIN_SOFT: usize = 8;
 const WHITE: u32 = 255;
 
-/// Returns the number of values between black and white of a mask with soft edges, which was drawn or resized with
-/// antialiasing; `None` for ids. Ids have places of their own: a pixel whose neighbours all have its id.
+/// Number of values between black and white in a mask with antialiased edges; `None` for ids, which have pixels whose
+/// neighbours all have the same id.
 pub(super) fn n_soft(ids: &[u32], width: usize) -> Option<usize> {
     let mut is_found = [false; WHITE as usize + 1];
     ids.iter().for_each(|id| is_found[(*id).min(WHITE) as usize] = true);
@@ -34,7 +34,7 @@ pub(super) fn n_soft(ids: &[u32], width: usize) -> Option<usize> {
     (10 * between().filter(is_inside).count() < between().count()).then_some(n)
 }
 
-/// Reads the ids of a PNG of the photo's size, row-major; with a palette, the ids are its indices.
+/// Ids of a PNG of the photo's size, row-major; of a palette, the indices.
 pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>, SegmentError> {
     let failed = |source| SegmentError::Png { path: path.to_owned(), source };
     let n_pixels = input.image.width() as usize * input.image.height() as usize;

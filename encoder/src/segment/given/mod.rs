@@ -16,12 +16,11 @@ use coco::too_large;
 /// Masks from files.
 ///
 /// A folder has one file per photo: for `left/a.jpg`, one of `left/a.png`, `left/a.jpg.png`, `left/a.json` and
-/// `left/a.jpg.json`. A PNG (gray of up to 16 bits, or with a palette) contains ids: 0 is background, each other
-/// id a mask. A JSON file is a list of `{"segmentation": {"size": [height, width], "counts": ..}}`, as SAM's
-/// automatic generator writes it, or an object with such a list as `annotations`; its masks may overlap. A folder
-/// `left/a/` has a black and white PNG for each mask, as SAM's `amg.py` writes it. A JSON file in place of the
-/// folder is a COCO data set of all photos, whose `file_name` may lack folders of the photo's name or have further
-/// ones.
+/// `left/a.jpg.json`. A PNG (gray of up to 16 bits, or with a palette) contains ids: 0 is background, each other id a
+/// mask. A JSON file is a list of `{"segmentation": {"size": [height, width], "counts": ..}}`, as SAM's automatic
+/// generator writes it, or an object with such a list as `annotations`; its masks may overlap. A folder `left/a/` has a
+/// black and white PNG per mask, as SAM's `amg.py` writes it. A JSON file in place of the folder is a COCO data set of
+/// all photos, whose `file_name` may lack folders of the photo's name or have further ones.
 ///
 /// Masks belong to the photos as taken and are undistorted with them.
 #[derive(Debug)]
@@ -37,7 +36,7 @@ enum Source {
 }
 
 impl GivenMasks {
-    /// Opens a folder of masks or reads a COCO data set. `ignore_ids` are further background ids of id images.
+    /// `ignore_ids` are further background ids of id images.
     pub fn open(path: &Path, ignore_ids: Vec<u32>) -> Result<Self, SegmentError> {
         let source = if files::metadata(path)?.is_dir() {
             Source::Folder(path.to_owned())
@@ -47,7 +46,7 @@ impl GivenMasks {
         Ok(Self { source, ignore_ids })
     }
 
-    /// Returns whether a view has masks: a file, or an entry in the data set.
+    /// Whether a view has a file, or an entry in the data set.
     pub fn covers(&self, view: &View) -> bool {
         match &self.source {
             Source::Folder(dir) => file_of(dir, view).is_some(),
@@ -55,7 +54,7 @@ impl GivenMasks {
         }
     }
 
-    /// Returns the masks of a view; `None` if it has no file or entry.
+    /// `None` if the view has no file or entry.
     pub fn load(&self, input: &SegmentInput<'_>) -> Result<Option<Vec<Mask>>, SegmentError> {
         let path = match &self.source {
             Source::DataSet { path, masks_of_image } => {
@@ -78,7 +77,7 @@ impl GivenMasks {
         }
     }
 
-    /// Refuses an entry of a data set that is found for several views: which one's it is, nothing says.
+    /// Refuses a data set's entry that matches several views: it is ambiguous.
     fn check_entries(&self, views: &[View]) -> Result<(), SegmentError> {
         let Source::DataSet { path, masks_of_image } = &self.source else { return Ok(()) };
         let mut view_of_entry: BTreeMap<&str, &str> = BTreeMap::new();
@@ -95,7 +94,7 @@ impl GivenMasks {
         Ok(())
     }
 
-    /// Names a file that is not read because its view has another one.
+    /// Names an unused file of a view that has another.
     fn second_file(&self, views: &[View]) -> Option<String> {
         let Source::Folder(dir) = &self.source else { return None };
         let [read, not] = views.iter().find_map(|view| {
@@ -105,7 +104,7 @@ impl GivenMasks {
         Some(format!("{} is read for masks, and {} beside it is not", read.display(), not.display()))
     }
 
-    /// Returns up to three names that the files or entries have.
+    /// Up to three names of files or entries.
     fn names_found(&self) -> Vec<String> {
         match &self.source {
             Source::DataSet { masks_of_image, .. } => masks_of_image.keys().take(3).cloned().collect(),
@@ -121,7 +120,7 @@ impl GivenMasks {
         }
     }
 
-    /// Returns the masks of an id image; `is_binary`: the one mask of a black and white image.
+    /// Masks of an id image; `is_binary`: the one mask of a black and white image.
     fn masks_of_png(
         &self,
         path: &Path,
@@ -132,7 +131,7 @@ impl GivenMasks {
         if let (false, Some(n)) = (is_binary, id_image::n_soft(&labels, input.image.width() as usize)) {
             return Err(SegmentError::SoftEdges { path: path.to_owned(), n });
         }
-        // With soft edges, what is inside by half.
+        // Soft edges are cut at half.
         let darkest = labels.iter().max().filter(|_| is_binary).map_or(1, |white| white / 2 + 1);
         for label in &mut labels {
             if *label < darkest || !is_binary && self.ignore_ids.contains(label) {
@@ -197,7 +196,7 @@ impl Segmenter for GivenMasks {
             Source::Folder(dir) => file_of(dir, view).map(|path| hash_of_masks(&path)).transpose(),
             Source::DataSet { masks_of_image, .. } => {
                 let hash = |(_, rles): (&String, &Vec<(usize, Rle)>)| -> Result<Hash32, SegmentError> {
-                    // Their places in the file name them in errors only.
+                    // Only errors need their indices in the file.
                     let rles: Vec<&Rle> = rles.iter().map(|(_, rle)| rle).collect();
                     Ok(Hash32::of(&serde_json::to_vec(&rles).map_err(std::io::Error::from)?))
                 };
@@ -211,7 +210,7 @@ impl Segmenter for GivenMasks {
     }
 }
 
-/// Returns the file with a view's masks in a folder of masks, if there is one, or the folder with a file a mask.
+/// A view's mask file in a folder of masks, or the folder with one file per mask.
 pub fn file_of(dir: &Path, view: &View) -> Option<PathBuf> {
     let folder = || Some(dir.join(&view.name).with_extension("")).filter(|of| of.join("0.png").is_file());
     files_of(dir, view).next().or_else(folder)
@@ -225,7 +224,7 @@ fn files_of(dir: &Path, view: &View) -> impl Iterator<Item = PathBuf> + use<> {
     files.into_iter().filter(|path| path.is_file())
 }
 
-/// Returns the images of a folder with a black and white PNG for each mask, by number.
+/// The images of a folder with a black and white PNG per mask, by number.
 fn binary_masks(folder: &Path) -> Result<Vec<PathBuf>, SegmentError> {
     let mut numbered = Vec::new();
     for entry in fs_err::read_dir(folder)? {
@@ -239,7 +238,7 @@ fn binary_masks(folder: &Path) -> Result<Vec<PathBuf>, SegmentError> {
     Ok(numbered.into_iter().map(|(_, path)| path).collect())
 }
 
-/// Returns the hash of a view's masks: the ending of the file, which says how it is read, and its content.
+/// Hash of a view's masks: the file's extension, which decides how it is read, and its content.
 fn hash_of_masks(path: &Path) -> Result<Hash32, SegmentError> {
     if path.is_dir() {
         let hashes =

@@ -8,26 +8,25 @@ use super::settings::{SamSettings, ScoreFilter};
 use super::upsample::Upsampler;
 use crate::masks::BoxPx;
 
-/// Distance within which a box touches an edge, as in the reference implementation.
+/// A box this near to an edge touches it, as in the reference implementation.
 const EDGE_TOLERANCE_PX: u32 = 20;
 /// A mask is contained if at least this share of it lies in another one ...
 const CONTAINED_SHARE: f64 = 0.85;
 /// ... of which it covers less than this share.
 const LARGE_SHARE: f64 = 0.5;
-/// Masks that stay where no score is above the threshold.
+/// Masks that stay if no score is above the threshold.
 const N_BEST: usize = 3;
 
-/// A mask that the filters judge.
 #[derive(Clone, Debug)]
 pub(super) struct Candidate {
     pub(super) mask: RunMask,
-    /// IoU with the true mask, predicted by the model.
+    /// Predicted by the model.
     pub(super) predicted_iou: f32,
     /// IoU of the mask with itself under a higher and a lower threshold.
     pub(super) stability: f64,
     /// 0 whole, 1 part, 2 subpart.
     pub(super) level: u8,
-    /// The crop of the image in which the mask was found.
+    /// Crop of the image in which the mask was found.
     pub(super) crop: BoxPx,
 }
 
@@ -44,16 +43,16 @@ pub(super) struct Filters<'a> {
 }
 
 impl Filters<'_> {
-    /// Returns, in order, the proposals of prompts that show an object, which have a sufficient predicted IoU, are
-    /// stable and are not cut by the crop.
+    /// Proposals, in order, of prompts that show an object, with a sufficient predicted IoU, stable, and not cut by the
+    /// crop.
     pub(super) fn candidates(&self, decoded: &Decoded, upsampler: &Upsampler, crop: BoxPx) -> Vec<Candidate> {
         let SamSettings { predicted_iou: least_iou, stability, stability_offset, .. } = *self.settings;
         let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
         let lists = self.settings.levels.lists();
-        // Three proposals per prompt, the smallest first.
+        // Three proposals per prompt, smallest first.
         let level_of = |at: usize| (MASKS_PER_PROMPT - 1 - at % MASKS_PER_PROMPT) as u8;
         let proposals = decoded.logits.par_chunks_exact(n_logits).zip(&decoded.predicted_ious).enumerate();
-        // SAM 2's own rule: there is an object where the logit is above 0.
+        // SAM 2's own rule: an object has a logit above 0.
         let shows_object =
             |at: usize| decoded.object_logits.get(at / MASKS_PER_PROMPT).is_none_or(|&logit| logit > 0.0);
         proposals
@@ -71,7 +70,7 @@ impl Filters<'_> {
             .collect()
     }
 
-    /// Returns whether a box touches an edge of the crop that is no edge of the image.
+    /// Whether a box touches an edge of the crop that is no edge of the image.
     fn is_cut_by(&self, crop: BoxPx, found: BoxPx) -> bool {
         // The last column and row are inclusive, as in the reference implementation.
         let edges = |b: BoxPx| [b.x0, b.y0, b.x1, b.y1];
@@ -85,7 +84,6 @@ impl Filters<'_> {
             .any(|((found, crop), image)| is_near(found, crop) && !is_near(found, image))
     }
 
-    /// Splits candidates into the lists that are filtered by themselves.
     pub(super) fn lists(&self, candidates: Vec<Candidate>) -> Vec<Vec<Candidate>> {
         let lists = self.settings.levels.lists();
         let mut found = vec![Vec::new(); lists.len()];
@@ -103,8 +101,8 @@ impl Filters<'_> {
         by_boxes(candidates, scores, self.settings.box_nms_iou)
     }
 
-    /// Drops duplicates between crops, removes small holes and islands, then drops duplicates by box
-    /// and by pixels, and applies LangSplat's filter if the settings ask for it.
+    /// Drops duplicates between crops, removes small holes and islands, drops duplicates by box and by pixels, and
+    /// applies LangSplat's filter if the settings ask for it.
     pub(super) fn unique_in_image(&self, mut candidates: Vec<Candidate>, n_crops: usize) -> Vec<Candidate> {
         let SamSettings { box_nms_iou, crop_nms_iou, mask_nms_iou, min_region_px, score_filter, .. } =
             *self.settings;
@@ -139,7 +137,7 @@ impl Filters<'_> {
     }
 }
 
-/// Returns whether all logits and scores are finite: one that is not is on neither side of a threshold.
+/// Whether all logits and scores are finite: others are on neither side of a threshold.
 pub(super) fn is_finite(decoded: &Decoded) -> bool {
     let Decoded { predicted_ious, object_logits, logits, .. } = decoded;
     let scores = predicted_ious.iter().chain(object_logits);
@@ -151,8 +149,8 @@ fn by_boxes(candidates: Vec<Candidate>, scores: Vec<f64>, most_iou: f64) -> Vec<
     suppress(candidates, scores, |a, b| box_iou(a.mask.box_px, b.mask.box_px) > most_iou)
 }
 
-/// Non-maximum suppression: in descending order of scores (equal ones in their order), keeps candidates that are
-/// no duplicate of a kept one.
+/// Non-maximum suppression: in descending order of scores (equal ones in order), keeps candidates that duplicate no
+/// kept one.
 fn suppress(
     candidates: Vec<Candidate>,
     scores: Vec<f64>,
@@ -169,8 +167,7 @@ fn suppress(
     kept
 }
 
-/// Returns the IoU of two boxes as computed by the reference implementation, in which areas exclude the last row
-/// and column; NaN for two lines.
+/// IoU of two boxes as in the reference implementation, where areas exclude the last row and column; NaN for two lines.
 fn box_iou(a: BoxPx, b: BoxPx) -> f64 {
     let area = |b: BoxPx| f64::from(b.width_px() - 1) * f64::from(b.height_px() - 1);
     let overlap = |low: u32, high: u32| f64::from(high.saturating_sub(low + 1));
@@ -178,10 +175,8 @@ fn box_iou(a: BoxPx, b: BoxPx) -> f64 {
     both / (area(a) + area(b) - both)
 }
 
-/// LangSplat's last filter of the masks of one level (Qin et al. 2024, `mask_nms` of `preprocess.py`). Returns the masks
-/// that stay, the one with the highest score first; equal scores in their order.
-///
-/// Unlike greedy suppression, a mask counts against others even where it is dropped itself.
+/// LangSplat's last filter of one level's masks (Qin et al. 2024, `mask_nms` of `preprocess.py`), best score first;
+/// equal scores in order. Unlike greedy suppression, a dropped mask still counts against others.
 pub(super) fn keep_by_score(mut candidates: Vec<Candidate>, filter: &ScoreFilter) -> Vec<Candidate> {
     candidates.sort_by(|a, b| b.score().total_cmp(&a.score()));
     let mut keeps: Vec<bool> = candidates.iter().map(|mask| mask.score() > filter.min_score).collect();

@@ -30,10 +30,10 @@ use upsample::Upsampler;
 
 pub use settings::{SamLevels, SamSettings, ScoreFilter};
 
-/// Opened models on each GPU: while the masks of some photos are filtered, the GPU has others.
+/// While the masks of some photos are filtered, the GPU has others.
 const MODELS_PER_GPU: usize = 2;
 
-/// Photos at a time in an opened model: one is embedded while the points of others are decoded and filtered.
+/// Concurrent photos per model: one is embedded while points of others are decoded and filtered.
 const PHOTOS_PER_MODEL: usize = 3;
 
 #[derive(Debug)]
@@ -45,8 +45,8 @@ pub struct SamSegmenter {
 }
 
 impl SamSegmenter {
-    /// Opens a model directory with a `[segment]` section in `model.toml`; `gpus`: those that share the photos,
-    /// where the session asks for GPUs.
+    /// Opens a model directory with a `[segment]` section in `model.toml`; `gpus` share the photos if the session asks
+    /// for GPUs.
     pub fn open(
         dir: &Path,
         settings: SamSettings,
@@ -60,7 +60,7 @@ impl SamSegmenter {
             let session = SessionOptions { gpu, ..session.clone() };
             (0..n_models).map(|_| Sam::open_for(dir, &session, n_points).map(Arc::new)).collect()
         };
-        // A GPU takes two seconds to begin, and does not wait for another.
+        // In parallel, because a GPU takes two seconds to start.
         let opened: Vec<_> = std::thread::scope(|scope| {
             let opening: Vec<_> = gpus.iter().map(|gpu| scope.spawn(|| open_on(*gpu))).collect();
             opening.into_iter().map(|one| one.join().unwrap_or_else(|panic| resume_unwind(panic))).collect()
@@ -77,7 +77,7 @@ impl SamSegmenter {
         Ok(Self { lanes: Lanes::new(of_gpus), is_on_gpus, settings, identity })
     }
 
-    /// Returns the masks of one crop, in pixels of the image, by list.
+    /// Masks of one crop, in pixels of the image, by list.
     fn masks_of_crop(
         &self,
         sam: &Sam,

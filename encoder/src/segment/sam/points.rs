@@ -2,15 +2,14 @@
 
 use crate::masks::BoxPx;
 
-/// Returns a grid of `n_per_side` x `n_per_side` points over an image, pixels, row by row; each is the centre of a
-/// cell.
+/// Centres of `n_per_side` x `n_per_side` cells of an image, pixels, row by row.
 pub(super) fn grid(n_per_side: u32, width_px: u32, height_px: u32) -> Vec<[f64; 2]> {
     let at = |i: u32, edge_px: u32| (f64::from(i) + 0.5) / f64::from(n_per_side) * f64::from(edge_px);
     (0..n_per_side).flat_map(|y| (0..n_per_side).map(move |x| [at(x, width_px), at(y, height_px)])).collect()
 }
 
-/// Returns crops with their layers: the whole image as layer 0 and, for each further layer `i`, 2^i x 2^i crops.
-/// Their overlap is `overlap_ratio` of the shorter edge in layer 1 and halves from layer to layer.
+/// Crops with their layers: the whole image as layer 0, and 2^i x 2^i crops for each further layer `i`. They overlap by
+/// `overlap_ratio` of the shorter edge in layer 1, half of that in each further layer.
 pub(super) fn crops(width_px: u32, height_px: u32, n_layers: u32, overlap_ratio: f64) -> Vec<(BoxPx, u32)> {
     let mut crops = vec![(BoxPx { x0: 0, y0: 0, x1: width_px, y1: height_px }, 0)];
     for layer in 1..=n_layers {

@@ -21,7 +21,7 @@ pub(super) struct RunMask {
 }
 
 impl RunMask {
-    /// Creates the set of these runs; `None` if there are none.
+    /// `None` without runs.
     pub(super) fn new(runs: Vec<Run>) -> Option<Self> {
         let (first, last) = (runs.first()?, runs.last()?);
         let x0 = runs.iter().map(|run| run.x0).min()?;
@@ -68,9 +68,8 @@ impl RunMask {
         both_px
     }
 
-    /// Fills holes and then removes islands with fewer than `min_px` pixels, but keeps the largest island.
-    ///
-    /// Pixels that touch at a corner are connected. Returns `None` if no hole or island is small.
+    /// Fills holes, then removes islands, of fewer than `min_px` pixels, but keeps the largest island. Pixels that
+    /// touch at a corner are connected. `None` if no hole or island is small.
     pub(super) fn without_small_regions(&self, width_px: u32, height_px: u32, min_px: u32) -> Option<Self> {
         let is_small = |size_px: &u64| *size_px < u64::from(min_px);
         let outside = complement(&self.runs, width_px, height_px);
@@ -93,7 +92,6 @@ impl RunMask {
     }
 }
 
-/// Returns the pixels of an image outside the runs.
 fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
     let mut gaps = Vec::new();
     let mut runs = runs.iter().peekable();
@@ -113,13 +111,13 @@ fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
 }
 
 struct Components {
-    /// Component of each run, numbered in the order of a row-major scan.
+    /// By run, numbered in the order of a row-major scan.
     of_run: Vec<u32>,
     sizes_px: Vec<u64>,
 }
 
-/// Finds the connected components of runs in row-major order. Runs in neighbouring rows are connected if they
-/// overlap or touch at a corner.
+/// Connected components of runs in row-major order; runs in neighbouring rows are connected if they overlap or touch at
+/// a corner.
 fn components(runs: &[Run]) -> Components {
     let mut sets = UnionFind::new(runs.len());
     let mut above = 0;

@@ -19,7 +19,7 @@ pub enum SamLevels {
 }
 
 impl SamLevels {
-    /// Returns the levels of each list that is filtered by itself: 0 whole, 1 part, 2 subpart.
+    /// Levels of each separately filtered list: 0 whole, 1 part, 2 subpart.
     pub(super) fn lists(self) -> &'static [&'static [u8]] {
         match self {
             Self::Merged => &[&[0, 1, 2]],
@@ -101,8 +101,8 @@ impl Default for SamSettings {
 }
 
 impl SamSettings {
-    /// The settings of the paper: LangSplat's mask generator (Qin et al. 2024, `preprocess.py`) on a grid of 16 x
-    /// 16 points, whole level only.
+    /// The paper's: LangSplat's mask generator (Qin et al. 2024, `preprocess.py`) on a grid of 16 x 16 points, whole
+    /// level only.
     pub fn paper() -> Self {
         Self {
             points_per_side: 16,

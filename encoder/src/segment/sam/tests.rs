@@ -21,7 +21,7 @@ use crate::ingest::LoadedImage;
 use crate::masks::{BoxPx, Mask};
 use crate::segment::{SegmentInput, Segmenter};
 
-/// Edges of the square and of the logits, pixels, in SAM's proportion.
+/// Edges of square and logits, pixels, in SAM's proportion.
 const SIZE_PX: u32 = 256;
 const LOGITS_PX: u32 = 64;
 
@@ -54,8 +54,8 @@ fn logits(blob: &Blob) -> Vec<f32> {
         .collect()
 }
 
-/// Returns synthetic answers to `n` prompts. Many objects repeat; some are soft, have a low predicted IoU, are
-/// cut, or have holes or islands.
+/// Synthetic answers to `n` prompts. Many objects repeat; some are soft, have a low predicted IoU, are cut, or have
+/// holes or islands.
 fn blobs(n: usize, seed: u64, extent: [f64; 2]) -> Vec<Blob> {
     let mut state = seed;
     let mut random = move || {
@@ -97,7 +97,7 @@ fn decoded(blobs: &[Blob]) -> Decoded {
     }
 }
 
-/// Resizes bilinearly in float64 with aligned pixel centres, from `[height][width]` to `[to[1]][to[0]]`.
+/// Bilinear in float64 with aligned pixel centres, from `[height][width]` to `[to[1]][to[0]]`.
 fn bilinear(values: &[f64], [width, height]: [usize; 2], to: [usize; 2]) -> Vec<f64> {
     let source = |at: usize, n_in: usize, n_out: usize| {
         let s = ((at as f64 + 0.5) * n_in as f64 / n_out as f64 - 0.5).max(0.0);
@@ -116,7 +116,7 @@ fn bilinear(values: &[f64], [width, height]: [usize; 2], to: [usize; 2]) -> Vec<
     out
 }
 
-/// The two resizing steps of SAM's post-processing, with the crop of the padding between them.
+/// The two resizing steps of SAM's post-processing, with the padding cropped between them.
 fn enlarged(logits: &[f32], letterbox: &Letterbox, logits_px: [u32; 2]) -> Vec<f64> {
     let logits: Vec<f64> = logits.iter().map(|&logit| f64::from(logit)).collect();
     let size = letterbox.size_px as usize;
@@ -188,7 +188,7 @@ impl Oracle {
         both / (area(a) + area(b) - both)
     }
 
-    /// Components of pixels that are `of`, by flooding over the eight neighbours.
+    /// Components of pixels equal to `of`, by flooding over the eight neighbours.
     fn floods(&self, inside: &[bool], of: bool) -> Vec<Vec<usize>> {
         let [width, height] = self.image_px;
         let mut seen = vec![false; inside.len()];
@@ -301,7 +301,7 @@ impl Oracle {
     }
 }
 
-/// Compares the filters with the recomputation and returns the number of masks kept.
+/// Compares the filters with the recomputation; returns the number of kept masks.
 fn compare(settings: SamSettings, image_px: [u32; 2], n_prompts: usize, seed: u64) -> usize {
     let filters = Filters { settings: &settings, image_px };
     let oracle = Oracle { settings: settings.clone(), image_px: image_px.map(|edge| edge as usize) };
@@ -343,7 +343,7 @@ fn the_filters_equal_a_plain_recomputation() {
     let n = |settings: &SamSettings| compare(settings.clone(), image_px, 24, 7);
     let n_all = n(&all);
     assert!(n_all > 50, "{n_all}");
-    // Each filter by itself drops something, and so do all together.
+    // Each filter alone drops something, and so do all together.
     for settings in [
         SamSettings { predicted_iou: 0.88, ..all.clone() },
         SamSettings { stability: 0.9, ..all.clone() },
@@ -357,11 +357,11 @@ fn the_filters_equal_a_plain_recomputation() {
         println!("{n_kept} of {n_all}: {settings:?}");
         assert!(n_kept > 0 && n_kept < n_all);
     }
-    // Regions are healed even where every island is small.
+    // Regions are healed even if every island is small.
     assert_eq!(n(&SamSettings { min_region_px: 1_000_000, crop_nms_iou: 1.0, ..all.clone() }), n_all);
 }
 
-/// Outlines, holes and rough places lie along blocks of pixels that are enlarged, beside others that are not.
+/// Outlines, holes and rough places lie along blocks that are enlarged, beside others that are not.
 #[test]
 fn rough_masks_equal_a_plain_recomputation() {
     let letterbox = Letterbox::new(SIZE_PX, [300, 200]);
@@ -393,7 +393,7 @@ fn rough_masks_equal_a_plain_recomputation() {
     assert!(n_inside > 100_000, "{n_inside}");
 }
 
-/// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
+/// The identity decides whether an encode may resume: other files or settings make another segmenter.
 #[needs_shared]
 #[test]
 fn the_identity_holds_model_and_settings() {
@@ -467,7 +467,7 @@ fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
     (array.shape().to_vec(), array.into_vec().expect("of that type"))
 }
 
-/// Compares enlarged masks with recorded results of `SamImageProcessor.post_process_masks`.
+/// Recorded results of `SamImageProcessor.post_process_masks`.
 #[needs_shared]
 #[test]
 fn enlarged_masks_equal_the_recorded_ones() {
@@ -505,7 +505,7 @@ fn enlarged_masks_equal_the_recorded_ones() {
     assert!(n_inside > 10_000 && n_differing < 5, "{n_inside} {n_differing}");
 }
 
-/// A pixel value that overflows is no number behind the model, as with models in half precision.
+/// An overflowing pixel value gives NaN behind the model, as with models in half precision.
 #[needs_shared]
 #[test]
 fn masks_that_are_no_numbers_fail_the_view() {

@@ -1,12 +1,11 @@
 //! Upsampling of the decoder's coarse logits to the pixels of an image.
 //!
 //! SAM enlarges the logits to its input square, crops the padding and scales the rest to the image; both steps are
-//! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step
-//! with at most three taps per axis, without the intermediate square. SAM 2 enlarges the logits to the image at
-//! once.
+//! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step with
+//! at most three taps per axis, without the intermediate square. SAM 2 enlarges the logits to the image at once.
 //!
-//! A block is the pixels that depend on the same three by three logits. Where these agree on all thresholds, so do
-//! its pixels, and only the blocks along outlines are enlarged. This gives the same bits as enlarging all.
+//! A block is the pixels that depend on the same three by three logits. If these agree on all thresholds, so do its
+//! pixels, and only the blocks along outlines are enlarged. This gives the same bits as enlarging all.
 
 use std::ops::Range;
 
@@ -15,15 +14,14 @@ use slag_models::sam::Letterbox;
 
 use super::runs::{Run, RunMask};
 
-/// The logits and weights of each pixel along an axis.
 struct Axis {
-    /// The first of three consecutive logits.
+    /// First of three consecutive logits.
     first: Vec<usize>,
     weights: Vec<[f32; 3]>,
 }
 
-/// Returns the two input neighbours of output pixel `at` and the weight of the second, when `n_in` pixels are
-/// resized to `n_out`. The source coordinate is (at + 1/2) n_in / n_out - 1/2, clamped to the input.
+/// The two input neighbours of output pixel `at`, and the weight of the second, when resizing `n_in` to `n_out` pixels.
+/// The source coordinate is (at + 1/2) n_in / n_out - 1/2, clamped to the input.
 fn neighbours(at: u32, n_in: u32, n_out: u32) -> ([u32; 2], f64) {
     let source = ((f64::from(at) + 0.5) * f64::from(n_in) / f64::from(n_out) - 0.5).max(0.0);
     let low = (source as u32).min(n_in - 1);
@@ -62,30 +60,29 @@ pub(super) struct Upsampler {
     n_columns: usize,
     x: Axis,
     y: Axis,
-    /// The columns of pixels of the blocks that begin at each logit.
+    /// Columns of pixels of the blocks that begin at each logit.
     columns: Vec<Range<usize>>,
 }
 
 /// A mask from thresholded logits.
 pub(super) struct Cut {
-    /// The pixels with a logit above 0.
+    /// Pixels with a logit above 0.
     pub(super) mask: RunMask,
     /// IoU between the masks above `+offset` and above `-offset`.
     pub(super) stability: f64,
 }
 
-/// What the logits of a block say of its pixels; as flags, so that those of neighbours combine with `&`.
+/// Flags of a block's pixels by its logits; neighbours combine with `&`.
 const ABOVE: u8 = 1;
 const BELOW: u8 = 2;
 const MIXED: u8 = 0;
 
-/// How far, relatively, logits lie beyond a threshold whose weighted means do too: the rounding of nine products
-/// and their sum, tenfold.
+/// Relative margin beyond a threshold at which weighted means of logits are beyond it, too: tenfold the rounding of
+/// nine products and their sum.
 const ROUNDING: f32 = 1e-5;
 
 impl Upsampler {
-    /// Creates the upsampling for `logits_px` columns and rows of logits: at least 3, at most the size of the
-    /// square.
+    /// `logits_px`: columns and rows of logits, at least 3, at most the size of the square.
     pub(super) fn new(letterbox: &Letterbox, logits_px: [u32; 2]) -> Self {
         let axis = |k: usize| {
             let image_px = letterbox.image_px[k];
@@ -101,12 +98,12 @@ impl Upsampler {
     }
 
     /// Enlarges `logits`, `[rows][columns]`, and thresholds them at 0; `None` if the mask is empty. `origin_px` is
-    /// added to the coordinates of the pixels.
+    /// added to the pixels' coordinates.
     pub(super) fn cut(&self, logits: &[f32], offset: f32, origin_px: [u32; 2]) -> Option<Cut> {
         InstructionSet::widest().dispatch(Cutting { upsampler: self, logits, offset, origin_px })
     }
 
-    /// Returns what each block says, `[rows][blocks]`.
+    /// Flags of the blocks, `[rows][blocks]`.
     #[inline(always)]
     fn blocks(&self, logits: &[f32], offset: f32) -> Vec<u8> {
         let limit = offset.abs() * (1.0 + ROUNDING) + f32::MIN_POSITIVE;
@@ -123,7 +120,7 @@ impl Upsampler {
         blocks
     }
 
-    /// Enlarges a row of logits along x, where one of the three rows of blocks that it belongs to is mixed.
+    /// Enlarges a row of logits along x, where one of its three rows of blocks is mixed.
     #[inline(always)]
     fn widen(&self, logits: &[f32], rows_of_blocks: &[u8], widened: &mut [f32]) {
         let n_blocks = self.columns.len();
@@ -138,7 +135,7 @@ impl Upsampler {
         }
     }
 
-    /// Splits a row of blocks into pixels in a row whose blocks say the same.
+    /// Splits a row of blocks into pixels in a row whose blocks have equal flags.
     #[inline(always)]
     fn stretches(&self, blocks: &[u8], found: &mut Vec<(u8, Range<usize>)>) {
         found.clear();
@@ -151,7 +148,6 @@ impl Upsampler {
     }
 }
 
-/// The cut of one mask.
 struct Cutting<'a> {
     upsampler: &'a Upsampler,
     logits: &'a [f32],
@@ -202,7 +198,7 @@ impl<S> Work<S> for Cutting<'_> {
     }
 }
 
-/// The pixels above 0 as they are found, row by row.
+/// Pixels above 0 as they are found, row by row.
 struct Outline {
     /// Logits of a row, for reuse.
     line: Vec<f32>,
@@ -214,7 +210,6 @@ struct Outline {
 }
 
 impl Outline {
-    /// Adds pixels that are above all thresholds.
     #[inline(always)]
     fn fill(&mut self, y: u32, pixels: Range<usize>) {
         self.n_high += pixels.len() as u64;
@@ -222,7 +217,7 @@ impl Outline {
         self.extend(y, pixels);
     }
 
-    /// Enlarges three rows along y and adds the pixels that are above 0.
+    /// Enlarges three rows along y and adds the pixels above 0.
     #[inline(always)]
     fn threshold(&mut self, y: u32, pixels: Range<usize>, taps: [&[f32]; 3], weights: [f32; 3]) {
         let [a, b, c] = taps.map(|row| &row[pixels.clone()]);
@@ -249,7 +244,7 @@ impl Outline {
         self.line = line;
     }
 
-    /// Adds pixels to the last run, if they follow it, else as a run.
+    /// Extends the last run, or begins a new one.
     #[inline(always)]
     fn extend(&mut self, y: u32, pixels: Range<usize>) {
         let (x0, x1) = (pixels.start as u32, pixels.end as u32);

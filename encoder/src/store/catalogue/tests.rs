@@ -10,7 +10,7 @@ fn files_of(folder: &Path, found: &mut Vec<PathBuf>) {
 }
 
 /// Every file of the database overwritten, cut or removed: the store opens, knows its cells, counts on from its
-/// manifest, and readers are told the truth meanwhile.
+/// manifest, and meanwhile readers are told the truth.
 #[test]
 fn a_damaged_catalogue_is_made_anew_from_the_files() {
     let damages: [fn(&Path); 4] = [
@@ -33,7 +33,7 @@ fn a_damaged_catalogue_is_made_anew_from_the_files() {
         let mut files = Vec::new();
         files_of(&dir.path().join("db"), &mut files);
         files.iter().for_each(|path| damage(path));
-        // A reader never believes a damaged catalogue.
+        // Readers never trust a damaged catalogue.
         let seen = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies");
         let generations = seen.map(|copy| copy.generations().expect("reads")).unwrap_or_default();
         assert!(generations.iter().all(|record| record.n_cells <= 2), "damage {number}");
@@ -72,7 +72,7 @@ fn snapshot_of(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files.into_iter().map(|path| (path.clone(), fs_err::read(path).expect("readable"))).collect()
 }
 
-/// While a writer holds the store, its history is read, and no file of it changes.
+/// Reading the history changes no file while a writer holds the store.
 #[test]
 fn a_copy_is_read_while_a_writer_is_at_work() {
     let [dir, scratch] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));

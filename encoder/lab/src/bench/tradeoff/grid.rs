@@ -9,10 +9,9 @@
 //! }]}
 //! ```
 //!
-//! `axis` names the varied setting. `views` are the flags of `encode` that change the
-//! views' contributions; `lift` are its other flags. The shards of `profile`
-//! are evaluated and measured. All profiles are made, because the exact shards tell which Gaussian is
-//! which.
+//! `axis` names the varied setting. `views` are the flags of `encode` that change the views' contributions, `lift`
+//! its other flags. The shards of `profile` are evaluated and measured; all profiles are made, because the exact
+//! shards tell which Gaussian is which.
 //!
 //! `{masks}` stands for the scene's folder of true masks, `{sam}` for the model directory of Segment Anything;
 //! without these a point is not run. Points of a scene with the same `views` share one store, and their
@@ -51,7 +50,6 @@ fn compact() -> Profile {
 }
 
 impl Grid {
-    /// Returns a built-in grid by its name, or reads one.
     pub(super) fn find(path: &Path) -> Result<Self> {
         let text = match path.to_str() {
             Some("quick") => include_str!("quick.json").to_owned(),

@@ -44,7 +44,7 @@ pub(super) fn measure(
                 of_point.insert((point.axis.as_str(), point.name.as_str()), figures);
             }
         }
-        // In the order of the grid, whatever the order of the work.
+        // In the grid's order, not that of the work.
         for point in &grid.points {
             match of_point.remove(&(point.axis.as_str(), point.name.as_str())) {
                 Some(Ok(figures)) => measured.push(figures),
@@ -61,10 +61,9 @@ pub(super) fn measure(
     Ok(report)
 }
 
-/// A point, and its figures or what the scene or machine lacks for it.
+/// A point with its figures, or with what the scene or machine lacks for it.
 type Measured<'p> = (&'p Point, Result<Figures, &'static str>);
 
-/// Measures points with the same contributions.
 fn measure_group<'p>(
     scene: &SceneFiles,
     group: &[&'p Point],
@@ -74,7 +73,6 @@ fn measure_group<'p>(
 ) -> Result<Vec<Measured<'p>>> {
     let store = out.join("store");
     let mut done = Vec::new();
-    // Seconds of the views, once known.
     let mut views_seconds = None;
     for point in group {
         let path = out.join("points").join(file_name(scene, point, programs));

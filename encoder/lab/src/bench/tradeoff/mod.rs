@@ -1,9 +1,8 @@
 //! `bench tradeoff`: cost and accuracy of each choice of settings, on labelled scenes.
 //!
-//! For each point of a [`grid`], the programs encode and evaluate the scene as a user runs them, each in
-//! its own process, so that threads and memory are those of the flags. A point leaves one JSON file; points with a
-//! file are not measured again. Points with the same contributions share a store: the seconds of the views are
-//! those of the first point, all other seconds are each point's own.
+//! For each point of a [`grid`], the programs encode and evaluate the scene as a user runs them, each in its own
+//! process, so that threads and memory are those of the flags. A point leaves one JSON file; points with a file are
+//! not measured again. Points with the same contributions share a store: the first carries the seconds of the views.
 
 mod grid;
 mod measure;
@@ -44,7 +43,6 @@ pub(crate) struct TradeoffArgs {
     models: ModelArgs,
 }
 
-/// Measures the points that have no file yet and summarises all.
 pub(crate) fn run(args: &TradeoffArgs, progress: &dyn Progress) -> Result<TradeoffReport> {
     let grid = Grid::find(&args.grid)?;
     // Opened first: a model that cannot be opened fails before hours of work.

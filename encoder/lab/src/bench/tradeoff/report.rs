@@ -47,15 +47,13 @@ type Cost = fn(&Figures) -> f64;
 
 const COSTS: [Cost; 2] = [|f| f.seconds, |f| f.bytes_per_gaussian];
 
-/// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate,
-/// and differs.
+/// Marks the Pareto-optimal (cost, accuracy) points: no different point is at least as cheap and as accurate.
 pub(super) fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
     let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
     points.iter().map(|point| !points.iter().any(|other| beats(other, point))).collect()
 }
 
 impl TradeoffReport {
-    /// Writes `tradeoff.json`, `tradeoff.md` and `front.json`.
     pub(super) fn write(&self, out: &Path) -> Result<()> {
         fs_err::write(out.join("tradeoff.json"), serde_json::to_vec_pretty(self)?)?;
         fs_err::write(out.join("tradeoff.md"), self.to_string())?;
@@ -77,8 +75,8 @@ impl TradeoffReport {
         of_first.map(of_point).filter(|of_point: &Vec<&Figures>| of_point.len() == scenes.len()).collect()
     }
 
-    /// Returns the settings that no other beats in seconds or bytes, on the mean of the scenes; only those that a
-    /// user can give on any scene: without placeholders, and flags of the machine.
+    /// Returns the settings that no other beats in seconds or bytes, on the mean of the scenes. Leaves out points with
+    /// placeholders or flags of the machine, which a user cannot give on every scene.
     fn front(&self) -> Front {
         let of_views = |f: &Figures| f.views_seconds + f.coverage_seconds;
         let mut settings: Vec<(f64, FrontSetting)> = Vec::new();

@@ -128,9 +128,9 @@ fn verdict(truth: &Truth<'_>, thing: usize, reply: &Value) -> Result<Verdict> {
 }
 
 struct Label {
-    /// Pixels that show it, over all photos.
+    /// Over all photos.
     n_pixels: u64,
-    /// Its object, as replies name it.
+    /// The object's id, as replies write it.
     object: Option<String>,
 }
 
@@ -147,8 +147,8 @@ fn labels(scene: &Path, store: &Path) -> Result<Vec<Label>> {
     Ok(truth.background.iter().chain(&truth.things).map(label).collect())
 }
 
-/// Returns the object of each thing: of those that are the thing by more than half of their Gaussians, the one
-/// with most. Boxes are not compared: strays make them as large as the room.
+/// Returns each thing's object: the largest with more than half of its Gaussians on the thing. Boxes are not
+/// compared, because strays make them as large as the room.
 fn objects_of_things(thing_of: &[u16], object_of: &[u32]) -> BTreeMap<u16, u32> {
     let (mut n_of_object, mut n_of_both) = (BTreeMap::new(), BTreeMap::new());
     for (thing, object) in thing_of.iter().zip(object_of).filter(|(_, object)| **object != NONE) {
@@ -165,10 +165,9 @@ fn objects_of_things(thing_of: &[u16], object_of: &[u32]) -> BTreeMap<u16, u32> 
 }
 
 enum Verdict {
-    /// The thing is no object on board.
+    /// The robot has no object that is the thing.
     NoObject,
     None(String),
-    /// A pose, and the truth about it.
     Pose {
         clearance_m: f64,
         is_reached: bool,
@@ -282,7 +281,7 @@ impl Places {
     }
 }
 
-/// Distance of the surface points that are looked at.
+/// Spacing of the tested surface points.
 const SPACING_M: f64 = 0.012;
 
 #[derive(Clone, Copy, Debug, Default, Serialize)]
@@ -343,7 +342,7 @@ fn surface_voxels(layout: &Layout, voxel: f64) -> HashSet<[i32; 3]> {
 }
 
 fn is_solid(layout: &Layout, point: DVec3) -> bool {
-    // A ceiling is a box around its whole room, of which only the surface is a thing.
+    // A ceiling's box encloses its whole room, but only the surface is a thing.
     let things = layout.placed.iter().filter(|placed| !placed.shell);
     let near = things.filter(|placed| placed.bounds.contains(point));
     near.flat_map(|placed| placed.object.parts.iter().map(move |part| (placed, part))).any(

@@ -49,7 +49,7 @@ impl Road {
             self.n_photos += 1;
             let Some(found) = located(service, &photo)? else { continue };
             self.n_located += 1;
-            // The odometry tells where the camera is, the photo where that is in the scene.
+            // Odometry gives the camera in its own frame, the photo the camera in the scene.
             let odom_from_camera = odom_from_scene * photo.camera_from_world.inverse();
             let odom_from_scene_as_found = odom_from_camera * found.inverse();
             for word in &reachable {
@@ -70,7 +70,7 @@ impl Road {
     }
 }
 
-/// Returns the pose of a photo's camera in the scene, as the robot finds it.
+/// Pose of a photo's camera in the scene, as the robot finds it.
 fn located(service: &Service, photo: &View) -> Result<Option<DAffine3>> {
     let path = format!("/v1/locate?focal_px={}", photo.intrinsics.focal_x_px);
     let found: Value = service.post_image(&path, &fs_err::read(&photo.image_path)?)?;

@@ -16,12 +16,12 @@ const REACH_M: f64 = 0.8;
 pub(super) const SENSOR_HEIGHT_M: f64 = 0.4;
 const HEIGHT_M: f64 = 0.5;
 const STEP_M: f64 = 0.1;
-/// Least share of the thing's Gaussians that must be seen. From one side hardly half of them are.
+/// Least visible share of the thing's Gaussians. From one side hardly half of them are seen.
 const MIN_VISIBLE: f64 = 0.02;
-/// Least share of the thing's outline that must truly be shown.
+/// Least visible share of the thing's outline.
 pub(super) const MIN_SHOWN: f64 = 0.1;
 const CELL_M: f64 = 0.02;
-/// Distance of the surface points that are looked at.
+/// Spacing of the tested surface points.
 const SPACING_M: f64 = 0.01;
 const MAX_PLACES: usize = 60;
 /// The picture that decides whether a thing is shown.
@@ -42,7 +42,7 @@ pub(super) struct Truth<'a> {
     solids: Solids,
     origin: DVec2,
     width: usize,
-    /// Distance of each cell to what the robot must not touch.
+    /// Squared distance of each cell to the nearest obstacle.
     squared: Vec<u32>,
     is_reached: Vec<bool>,
     pub(super) start: DVec3,
@@ -57,7 +57,7 @@ impl<'a> Truth<'a> {
         let origin = low - 2.0 * CELL_M;
         let size = (high - origin) / CELL_M;
         let (width, height) = (size.x.ceil() as usize + 3, size.y.ceil() as usize + 3);
-        // Beyond the ground nothing carries a robot.
+        // The robot cannot stand beyond the ground.
         let mut is_obstacle: Vec<bool> = (0..width * height)
             .map(|cell| {
                 let at =
@@ -123,7 +123,7 @@ impl<'a> Truth<'a> {
         let near =
             (0..squared.len()).filter(|cell| self.is_reached[*cell] && f64::from(squared[*cell]) <= limit);
         let places: Vec<usize> = near.collect();
-        // Spread over all of them, not along the first side; a step that is no divisor of a row.
+        // Spread over all of them, not along the first side only.
         let step = places.len().div_ceil(MAX_PLACES).max(1);
         places.into_iter().step_by(step).any(|cell| {
             let at = self.origin
@@ -132,7 +132,7 @@ impl<'a> Truth<'a> {
         })
     }
 
-    /// Returns the share of a thing's outline that a sensor sees, of what it would see without the other things.
+    /// Visible share of a thing's outline: what a sensor sees over what it would see without the other things.
     pub(super) fn shown(&self, thing: usize, sensor: DVec3) -> f64 {
         let towards = self.solids.things[thing].centre - sensor;
         let level = towards.with_z(0.0).length().max(0.05);

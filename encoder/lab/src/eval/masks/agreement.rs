@@ -9,10 +9,9 @@ use slag_encoder::raster::RasterView;
 
 use super::segments::{Ious, MIN_PX, areas};
 
-/// Largest relative difference between a point's depth and that of the splat where it is drawn: more is hidden.
+/// A point is hidden where its depth differs from the splat's by more than this, relatively.
 const MAX_DEPTH_ERROR: f64 = 0.03;
 
-/// A segmented photo, and the depth of the splat there.
 pub(super) struct Seen {
     pub(super) view: RasterView,
     /// Camera z of each pixel; 0 where there is no splat.
@@ -61,7 +60,7 @@ impl Agreement {
     }
 }
 
-/// Returns for each pixel of the second photo the pixel of the first that shows the same point of the splat.
+/// For each pixel of the second photo, finds the pixel of the first that shows the same point of the splat.
 fn pixels_in(first: &Seen, second: &Seen) -> Vec<Option<u32>> {
     let first_from_second = first.view.camera_from_world * second.view.camera_from_world.inverse();
     let (k, to) = (second.view.intrinsics, first.view.intrinsics);

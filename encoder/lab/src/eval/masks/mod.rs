@@ -139,7 +139,7 @@ fn open(name: &Path, session: &SessionOptions) -> Result<Box<dyn Segmenter>> {
     })
 }
 
-/// Returns pairs of neighbouring views: all of them, or as many evenly spread ones as have `limit` photos.
+/// Returns pairs of neighbouring views, evenly spread where `limit` photos are fewer than all.
 fn pairs(views: &[View], limit: Option<u32>) -> Vec<[&View; 2]> {
     let all: Vec<[&View; 2]> = views.chunks_exact(2).map(|pair| [&pair[0], &pair[1]]).collect();
     let n = limit.map_or(all.len(), |limit| (limit as usize / 2).clamp(1, all.len().max(1)));
@@ -182,7 +182,6 @@ impl Judge<'_> {
         Ok(row)
     }
 
-    /// Segments a photo and counts its masks.
     fn photo(&self, view: &View, row: &mut Row) -> Result<Seen> {
         let loaded = ingest::load_image(view)?;
         let view = RasterView::of(&loaded.view);

@@ -38,7 +38,7 @@ impl Segments {
         all
     }
 
-    /// Adds a photo: its masks, the id of each pixel, the ids that are labels, and those of them that are things.
+    /// Adds a photo: its masks, each pixel's id, the labelled ids, and those of them that are things.
     pub(super) fn add(
         &mut self,
         regions: &RegionMap,
@@ -88,7 +88,7 @@ impl Segments {
     }
 }
 
-/// Masks and labelled segments with fewer pixels do not count, as in `encode`.
+/// Smaller masks and segments do not count, as in `encode`.
 pub(super) const MIN_PX: u32 = 200;
 
 pub(super) fn areas(

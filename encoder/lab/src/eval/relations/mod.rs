@@ -24,7 +24,7 @@ use truth::Asked;
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
-/// Least intersection over union of an answer's box and a thing's; else the thing that its position lies in.
+/// Least intersection over union of an answer's box and a thing's; below it, the thing around its position counts.
 const MIN_IOU: f64 = 0.1;
 /// Distance by which a position may lie outside.
 const TOLERANCE_M: f64 = 0.25;
@@ -53,7 +53,7 @@ struct Question {
     asked: Asked,
     thing: String,
     text: String,
-    /// Indices of the things meant; empty if none is.
+    /// Indices of the things meant; empty if there is none.
     truth: Vec<usize>,
 }
 
@@ -98,7 +98,6 @@ fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
     Ok(())
 }
 
-/// Returns the middle of a scene, where the robot stands.
 fn middle(things: &[Thing]) -> DVec3 {
     let all = things.iter().fold(Aabb::EMPTY, |all, thing| Aabb {
         min: all.min.min(thing.aabb_min),
@@ -107,8 +106,7 @@ fn middle(things: &[Thing]) -> DVec3 {
     all.centre().with_z(0.0)
 }
 
-/// Returns questions about the things of a scene: for each relation those with an answer and those without, evenly
-/// spread over all pairs of words.
+/// Returns for each relation the questions with and without an answer, evenly spread over all pairs of words.
 fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     let is_shown = |thing: &&Thing| thing.train_pixels >= MIN_PIXELS;
     let nouns: BTreeSet<&str> = things.iter().filter(is_shown).map(|thing| thing.category.as_str()).collect();
@@ -125,14 +123,14 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
         let mut of_relation: [Vec<Question>; 2] = [Vec::new(), Vec::new()];
         for thing in &ones {
             for of in nouns.iter().filter(|of| *of != thing) {
-                // One thing must be meant by the second word, or the question is ambiguous.
+                // The second word must mean one thing, or the question is ambiguous.
                 let n_of = things.iter().filter(|thing| thing.sounds_like(of)).count();
                 let is_part = |at: &Thing| at.sounds_like(thing) && at.sounds_like(of);
                 if n_of != 1 || things.iter().any(is_part) {
                     continue;
                 }
                 let truth = truth::meant(things, asked, thing, of, robot);
-                // What a picked thing is compared with must be visible to be compared.
+                // The thing that a picked one is compared with must be visible.
                 if truth.iter().any(|at| things[*at].train_pixels < MIN_PIXELS) {
                     continue;
                 }
@@ -149,10 +147,9 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     all
 }
 
-/// Asks a question one way; returns the answers, best first.
 fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result<Vec<Value>> {
     let near = [robot.x, robot.y, 0.0];
-    // Nearness of the answers must not decide: the plain phrase is asked without a position.
+    // Distance must not affect the plain phrase, so it is asked without a position.
     let body = match way {
         Way::Relations => json!({"texts": [question.text], "near": near, "limit": LIMIT}),
         Way::Phrase => json!({"texts": [question.text], "relations": false, "limit": LIMIT}),
@@ -161,7 +158,7 @@ fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result
     let mut reply = service.post("/v1/query", &body)?;
     match reply["results"][0]["answers"].take() {
         Value::Array(answers) => Ok(answers),
-        // Words that the model does not know are no answer.
+        // 422: words unknown to the model.
         _ if reply["status"] == 422 => Ok(Vec::new()),
         _ => Err(anyhow!("{}: {}", question.text, reply["detail"])),
     }

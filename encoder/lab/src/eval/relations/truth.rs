@@ -9,15 +9,15 @@ use crate::eval::truth::Thing;
 
 /// Distance of two boxes at which their things are near each other, metres.
 const NEAR_M: f64 = 1.0;
-/// The same for things beside each other.
+/// The same for "beside".
 const BESIDE_M: f64 = 0.8;
 /// Distance up to which directions are asked about.
 const SEEN_M: f64 = 5.0;
-/// Largest angle from a direction, degrees: the four directions share no thing.
+/// Largest angle from a direction, degrees; the four directions do not overlap.
 const SEEN_DEG: f64 = 45.0;
-/// Gap between a thing and the top that it stands on.
+/// Largest gap between a thing and the top it stands on.
 const TOUCHES_M: f64 = 0.05;
-/// A thing on another is at least this far from the ground.
+/// Least height above the ground of a thing that stands on another.
 const RAISED_M: f64 = 0.1;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -74,7 +74,7 @@ impl Thing {
         self.category == word || self.kinds.iter().any(|kind| kind == word)
     }
 
-    /// Returns whether it looks like what a word names: "chair" names an armchair to some.
+    /// Returns whether a word may name it: "chair" names an armchair to some.
     pub(super) fn sounds_like(&self, word: &str) -> bool {
         self.is_called(word) || self.category.contains(word)
     }
@@ -88,7 +88,7 @@ impl Thing {
     }
 }
 
-/// Returns the things that a question means, by their indices. `robot`: where it is asked.
+/// Returns the indices of the things that a question means. `robot`: where it is asked.
 pub(super) fn meant(things: &[Thing], asked: Asked, thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
     let named =
         |word: &str| -> Vec<usize> { (0..things.len()).filter(|at| things[*at].sounds_like(word)).collect() };
@@ -124,7 +124,6 @@ pub(super) fn meant(things: &[Thing], asked: Asked, thing: &str, of: &str, robot
     }
 }
 
-/// Returns whether a thing stands on another, as the layout places things on tops.
 fn is_on(thing: &Thing, below: &Thing) -> bool {
     let centre = thing.centre().truncate();
     let over = centre.cmpge(below.aabb_min.truncate()).all() && centre.cmple(below.aabb_max.truncate()).all();
@@ -142,8 +141,7 @@ fn is_level(a: &Thing, b: &Thing) -> bool {
     shared >= 0.3 * lower
 }
 
-/// Returns whether a thing lies in a direction from another: degrees to the left of the line from the robot to
-/// that.
+/// Returns whether a thing is seen in a direction from another: degrees to the left of the line from robot to `of`.
 fn is_seen(thing: &Thing, of: &Thing, robot: DVec3, direction_deg: f64) -> bool {
     let sight = (of.centre() - robot).truncate();
     let offset = (thing.centre() - of.centre()).truncate();

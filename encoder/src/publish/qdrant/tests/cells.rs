@@ -25,7 +25,7 @@ fn names(server: &Server) -> Vec<String> {
 }
 
 impl Fixture {
-    /// Checks that every cell's collection holds the points of that cell alone, and together all.
+    /// Each cell's collection holds only that cell's points, and together they hold all.
     fn assert_cells_arrived(&self, server: &Server, generation: i64) {
         let collections = server.with(|state| state.collections.clone());
         let n_cells = self.store.reader().expect("published").manifest().cells.len();
@@ -68,14 +68,14 @@ async fn each_cell_has_its_collection_with_its_points_and_settings() {
     }
 }
 
-/// A cell that was dropped, or lost a point, is pushed again; the others stay.
+/// A dropped cell, or one with a lost point, is pushed again; the others stay.
 #[tokio::test]
 async fn a_cell_is_repaired_alone() {
     let fixture = fixture();
     let (server, url) = Server::start(None).await;
     fixture.push(&cells(&url)).await.expect("pushes");
     server.with(|state| state.collections.remove(NAMES[0]));
-    // Cut off in the new collection: the record of the old one must not count.
+    // Cut off in the new collection: the old one's record must not count.
     let n_before = server.with(|state| state.acknowledged.len());
     fixture.push_cut_off(&server, &cells(&url), n_before + 2).await.expect_err("stopped");
     let report = fixture.push(&cells(&url)).await.expect("fills it again");
@@ -108,7 +108,7 @@ async fn a_new_generation_replaces_cells_and_deletes_those_it_lacks() {
     ];
     let others = others.map(|(name, held)| (name.to_owned(), held));
     server.with(|state| state.collections.extend(others));
-    // The second cell, now gone, is empty; the third is gone as well.
+    // The second cell is now empty; the third is gone as well.
     fixture.publish_cells(2, 20, &[(30, 25)]);
     let report = fixture.push(&cells(&url)).await.expect("pushes");
     assert_eq!((report.n_points, report.n_collections, report.n_created_collections), (25, 1, 0));
@@ -127,7 +127,7 @@ async fn a_new_generation_replaces_cells_and_deletes_those_it_lacks() {
     assert_eq!(names(&server), left);
     fixture.assert_cells_arrived(&server, 2);
 
-    // A generation that has the cells again makes them anew.
+    // A generation with these cells makes them anew.
     fixture.publish(3, 0);
     server.with(|state| state.collections.retain(|name, _| name == NAMES[0]));
     let report = fixture.push(&cells(&url)).await.expect("pushes");
@@ -140,7 +140,7 @@ async fn a_new_generation_replaces_cells_and_deletes_those_it_lacks() {
     fixture.assert_arrived(&server, 3);
 }
 
-/// The last cell's collection is foreign: nothing is written to the first ones either.
+/// The last cell's collection is foreign: nothing is written to the first ones, either.
 #[tokio::test]
 async fn foreign_cells_are_refused_before_anything_is_written() {
     let fixture = fixture();

@@ -80,7 +80,7 @@ service!(Collections {
 });
 
 service!(Snapshots {
-    /// A snapshot has a new name, the number of points as its size, and a checksum made of the collection's name.
+    /// A snapshot has a new name, the number of points as its size, and a checksum from the collection's name.
     async fn create(&self, request: Request<CreateSnapshotRequest>) -> Result<Response<CreateSnapshotResponse>, Status> {
         let name = self.admit(request)?.collection_name;
         self.with(|state| {

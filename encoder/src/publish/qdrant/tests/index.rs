@@ -13,7 +13,7 @@ use super::server::Server;
 use super::*;
 use crate::publish::qdrant::settings::Quantisation;
 
-/// A creation without any setting: vectors and distance alone.
+/// Vectors and distance alone.
 fn plain() -> CreateCollection {
     let vectors = VectorParamsBuilder::new(DIM as u64, Distance::Cosine);
     CreateCollectionBuilder::new("yard").vectors_config(vectors).build()
@@ -110,7 +110,7 @@ async fn a_collection_of_other_settings_is_changed_only_where_asked() {
     };
     assert_eq!(server.with(|state| state.updated.clone()), [request]);
 
-    // One setting alone: the others are not in the request.
+    // A single setting: the request has no others.
     let index = IndexSettings { hnsw_m: Some(0), ..IndexSettings::default() };
     fixture.push(&PushOptions { index, ..options.clone() }).await.expect("changes");
     let index = IndexSettings { quantisation: Some(Quantisation::None), ..IndexSettings::default() };

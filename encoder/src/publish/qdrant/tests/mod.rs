@@ -24,7 +24,7 @@ use crate::store::{Extras, Store};
 use server::Server;
 
 const DIM: usize = 16;
-/// Gaussians of the cells, and how many of them have an embedding.
+/// Gaussians of the cells, and those of them with an embedding.
 const CELLS: [(u32, u32); 3] = [(60, 50), (7, 0), (45, 45)];
 const N_POINTS: u64 = 95;
 const BATCH: usize = 8;
@@ -47,12 +47,12 @@ fn fixture() -> Fixture {
 }
 
 impl Fixture {
-    /// Publishes a generation whose splat indices begin at `first_id`.
+    /// `first_id`: first splat index.
     fn publish(&mut self, generation: u64, first_id: u32) {
         self.publish_cells(generation, first_id, &CELLS);
     }
 
-    /// Publishes a generation of these cells: Gaussians, and how many have an embedding.
+    /// `cells`: Gaussians, and those of them with an embedding.
     fn publish_cells(&mut self, generation: u64, first_id: u32, cells: &[(u32, u32)]) {
         let mut random = Random::new(generation);
         self.truth.clear();
@@ -143,7 +143,6 @@ impl Fixture {
         self.push_until(options, std::future::pending()).await.map(|(report, _)| report)
     }
 
-    /// Pushes until the server has acknowledged some batches.
     async fn push_cut_off(
         &self,
         server: &Server,
@@ -164,13 +163,13 @@ impl Fixture {
         ended.map(|(report, _)| report)
     }
 
-    /// Checks that the server holds exactly this generation, every value as it was made.
+    /// The server holds exactly this generation, with every value as made.
     fn assert_arrived(&self, server: &Server, generation: i64) {
         let points = server.with(|state| state.collections["yard"].points.clone());
         self.assert_points(&points, generation);
     }
 
-    /// Checks that points are exactly this generation's, every value as it was made.
+    /// The points are exactly this generation's, with every value as made.
     fn assert_points(&self, points: &BTreeMap<u64, server::Stored>, generation: i64) {
         assert_eq!(points.keys().collect::<Vec<_>>(), self.truth.keys().collect::<Vec<_>>());
         let reader = self.store.reader().expect("published");
@@ -234,23 +233,23 @@ async fn every_point_arrives() {
     );
 }
 
-/// The client repeats a request once by itself, so three failures in a row need a repetition of ours.
+/// The client itself repeats once, so it takes three failures in a row to need our repetition.
 #[tokio::test]
 async fn batches_that_fail_are_repeated() {
     let fixture = fixture();
-    // The first ids of all batches, as a push without failures sends them.
+    // First ids of all batches, as a push without failures sends them.
     let (undisturbed, url) = Server::start(None).await;
     fixture.push(&options(&url)).await.expect("pushes");
     let ids = undisturbed.with(|state| state.acknowledged.clone());
     assert_eq!(ids.len(), N_BATCHES);
     let (server, url) = Server::start(None).await;
-    // Every third batch; every sixth is applied and only its acknowledgement is lost.
+    // Every third batch; every sixth is applied and only its acknowledgement lost.
     let failures = ids.iter().step_by(3).enumerate().map(|(i, id)| (*id, (3, i % 2 == 1))).collect();
     server.with(|state| state.failures = failures);
     let report = fixture.push(&options(&url)).await.expect("pushes");
     assert_eq!((report.n_points, report.n_sent), (N_POINTS, N_POINTS));
     assert_eq!(server.with(|state| state.n_failed), 3 * 5);
-    // Attempts 1 and 2 fail in one call, 3 in the next, whose repetition by the client succeeds.
+    // Attempts 1 and 2 fail in one call, 3 in the next, where the client's repetition succeeds.
     assert_eq!(report.n_retries, 5);
     assert_eq!(server.with(|state| state.acknowledged.clone()), ids);
     fixture.assert_arrived(&server, 1);
@@ -268,7 +267,7 @@ async fn batches_that_fail_are_repeated() {
 
 #[tokio::test]
 async fn a_push_that_is_cut_off_continues() {
-    // Stopped after its acknowledgement by the server, before it is noted; everywhere in turn.
+    // Stopped after the server's acknowledgement, before it is recorded; everywhere in turn.
     for stop_after in [1, 5, 7, 8, 12, N_BATCHES] {
         let fixture = fixture();
         let (server, url) = Server::start(None).await;
@@ -281,7 +280,7 @@ async fn a_push_that_is_cut_off_continues() {
         assert_eq!(report.n_created_collections, 0);
         assert_eq!((report.n_points, report.n_without_evidence), (N_POINTS, 17), "{stop_after}");
         let all = server.with(|state| state.acknowledged.clone());
-        // At most the one batch that was acknowledged but not noted comes twice.
+        // Only a batch that was acknowledged but not recorded may come twice.
         let distinct: BTreeSet<u64> = all.iter().copied().collect();
         assert_eq!(distinct.len(), N_BATCHES, "{stop_after}");
         assert!(all.len() <= N_BATCHES + 1, "{stop_after}: {} batches were sent", all.len());
@@ -292,7 +291,7 @@ async fn a_push_that_is_cut_off_continues() {
     }
 }
 
-/// Between the collection and its indexes a push may be cut off; the next one makes the missing indexes.
+/// A push may be cut off between collection and indexes; the next one makes those.
 #[tokio::test]
 async fn missing_payload_indexes_are_made_by_the_next_push() {
     let fixture = fixture();
@@ -320,11 +319,11 @@ async fn a_new_generation_starts_over_and_replaces() {
     assert_eq!((report.n_sent, report.n_created_collections), (N_POINTS, 0));
     fixture.assert_arrived(&server, 2);
 
-    // A collection that was deleted is filled again, whatever the record says.
+    // A deleted collection is filled again, whatever the record says.
     server.with(|state| *state = server::State::default());
     let report = fixture.push(&options(&url)).await.expect("pushes");
     assert_eq!((report.n_sent, report.n_created_collections), (N_POINTS, 1));
-    // One that lost points is noticed, and filled by the next push.
+    // Lost points are noticed and restored by the next push.
     server.with(|state| state.collections.get_mut("yard").expect("created").points.pop_first());
     let lost = fixture.push(&options(&url)).await.expect_err("a point is missing");
     assert!(matches!(lost, PushError::Count { expected: N_POINTS, found: 94, .. }), "{lost}");
@@ -369,7 +368,7 @@ async fn errors_that_do_not_pass_are_not_repeated_and_hide_the_key() {
     let refused = fixture.push(&unreachable).await.expect_err("nobody there").to_string();
     assert!(refused.contains("Failed to connect") && refused.contains("6333 is REST's"), "{refused}");
     assert!(refused.len() < 300 && !refused.contains("MetadataMap"), "{refused}");
-    // However many attempts are left, one that was never reached is not waited for.
+    // A server that was never reached is not waited for, however many attempts are left.
     let patient = PushOptions { n_retries: 1000, connect_patience: Duration::from_millis(50), ..unreachable };
     let begun = std::time::Instant::now();
     let refused = fixture.push(&patient).await.expect_err("nobody there").to_string();

@@ -40,13 +40,13 @@ pub(super) struct State {
     /// Requests that create and update collections, in order.
     pub(super) created: Vec<CreateCollection>,
     pub(super) updated: Vec<UpdateCollection>,
-    /// Snapshots that are still to be made before one is refused.
+    /// Snapshots to make before one is refused.
     pub(super) n_snapshots_allowed: Option<u32>,
-    /// Requests for a payload index that are still to be refused.
+    /// Requests for a payload index to refuse.
     pub(super) n_indexes_refused: u32,
-    /// First id of every batch that was acknowledged, in order.
+    /// First id of every acknowledged batch, in order.
     pub(super) acknowledged: Vec<u64>,
-    /// Batches that are still to fail, by first id: how often, and whether after they took effect.
+    /// Batches to fail, by first id: how often, and whether after they took effect.
     pub(super) failures: HashMap<u64, (u32, bool)>,
     pub(super) n_failed: u32,
 }
@@ -172,7 +172,7 @@ fn passes(payload: &HashMap<String, Value>, filter: &Filter) -> Result<bool, Sta
     Ok(true)
 }
 
-/// Implements a service by the functions given and refuses the others.
+/// Implements a service by the given functions and refuses the others.
 macro_rules! service {
     ($service:ident { $($given:item)* } refused { $($name:ident: $request:ty => $response:ty;)* }) => {
         #[tonic::async_trait]

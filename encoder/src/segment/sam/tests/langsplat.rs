@@ -40,7 +40,7 @@ struct Mask {
 }
 
 impl Mask {
-    /// Returns whether a pixel lies in `x0 y0 x1 y1` of a rectangle, or its centre in `x y rx ry` of an ellipse.
+    /// Whether a pixel lies in `x0 y0 x1 y1` of a rectangle, or its centre in `x y rx ry` of an ellipse.
     fn contains(&self, x: u32, y: u32) -> bool {
         let ([a, b, c, d], x, y) = (self.at, i64::from(x), i64::from(y));
         match self.shape.as_str() {
@@ -86,7 +86,7 @@ fn the_score_filter_keeps_what_langsplats_own_code_keeps() {
                 crop: BoxPx { x0: 0, y0: 0, x1: width_px, y1: height_px },
             })
             .collect();
-        // Scores tell the masks of a set apart. LangSplat leaves masks in their order, ours go by score.
+        // Scores identify the masks of a set. LangSplat keeps the order of masks, ours go by score.
         let of = |score: f64| {
             candidates.iter().position(|c| c.score().total_cmp(&score).is_eq()).expect("one of them")
         };

@@ -3,7 +3,7 @@
 use super::super::SamLevels;
 use super::*;
 
-/// Levels are filtered by themselves: a part that equals its whole stays, where both levels are asked for.
+/// Levels are filtered separately: a part that equals its whole stays if both levels are asked for.
 #[test]
 fn levels_do_not_suppress_each_other() {
     // Only boxes decide, so that many of the repeated objects are duplicates.
@@ -27,7 +27,7 @@ fn levels_do_not_suppress_each_other() {
     }
 }
 
-/// Returns level and area of the masks that the filters keep of synthetic answers.
+/// Levels and areas of the masks that the filters keep of synthetic answers.
 fn kept_levels(settings: SamSettings) -> Vec<(u8, u32)> {
     let image_px = [230, 170];
     let filters = Filters { settings: &settings, image_px };

@@ -36,8 +36,8 @@ fn segment(segmenter: &SamSegmenter, image: &image::RgbImage) -> Vec<Mask> {
     segmenter.segment(&input).expect("it segments")
 }
 
-/// The recorded prompts are a grid of 3 x 3; those with a logit below 0 show no object. Oracle: one bilinear step
-/// in float64 from the logits, which another test compares with PyTorch's.
+/// The recorded prompts are a grid of 3 x 3; a logit below 0 means no object. Oracle: one bilinear step in float64 from
+/// the logits, which another test compares with PyTorch's.
 #[test]
 fn masks_are_those_of_prompts_with_an_object() {
     let (segmenter, photo) = (open(all(3)), photo());
@@ -62,14 +62,14 @@ fn masks_are_those_of_prompts_with_an_object() {
     for mask in &found {
         let pixels = (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (x as u32, y as u32)));
         let inside: Vec<bool> = pixels.map(|(x, y)| mask.contains(x, y)).collect();
-        // Logits in f32 and f64 may part at the border.
+        // Logits in f32 and f64 may differ at the border.
         let differing = |other: &[bool]| other.iter().zip(&inside).filter(|(a, b)| a != b).count();
         let nearest = expected.iter().filter(|(level, _)| *level == mask.level);
         assert!(nearest.map(|(_, other)| differing(other)).min().is_some_and(|n| n < 3));
     }
 }
 
-/// Compares with `torch.nn.functional.interpolate`, which the reference's post-processing is.
+/// `torch.nn.functional.interpolate` is the reference's post-processing.
 #[test]
 fn masks_are_enlarged_in_one_step() {
     let segmenter = open(all(3));
@@ -96,7 +96,7 @@ fn masks_are_enlarged_in_one_step() {
     assert!(n_inside > 100, "{n_inside}");
 }
 
-/// Images larger and smaller than the logits; noise of low frequency, so that masks have borders everywhere.
+/// Images larger and smaller than the logits; low-frequency noise, so that masks have borders everywhere.
 #[test]
 fn stretched_masks_equal_a_plain_recomputation() {
     let logits: Vec<f32> = (0..64 * 64)
