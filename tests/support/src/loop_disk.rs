@@ -3,6 +3,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::thread::sleep;
+use std::time::Duration;
 
 /// Blocks that a file's inode lists itself; an indirect block lists the others.
 pub const N_DIRECT_BLOCKS: usize = 12;
@@ -33,8 +35,15 @@ impl LoopDisk {
         run(Command::new("mount").args(["-o", "loop,errors=continue"]).arg(&self.image).arg(&self.at));
     }
 
+    /// A program that another test starts has all open files of this process until it begins, so it is tried again.
     fn unmount(&self) {
-        run(Command::new("umount").arg(&self.at));
+        let unmounts = |_: &u32| {
+            sleep(Duration::from_millis(50));
+            Command::new("umount").arg(&self.at).output().is_ok_and(|output| output.status.success())
+        };
+        if (0..100).find(unmounts).is_none() {
+            run(Command::new("umount").arg(&self.at));
+        }
     }
 
     fn debugfs(&self, request: &str) -> String {
