@@ -272,7 +272,7 @@ pub fn axes_service(dim: usize, gate: Gate) -> (TextService, Arc<AtomicUsize>) {
 pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
     let listed: Vec<_> = shards.iter().map(|shard| (Profile::Compact, &*shard.bytes)).collect();
     let mut manifest = Manifest { generation, ..sample::manifest("yard", &listed) };
-    (manifest.encoder.name, manifest.encoder.default_threshold) = ("slag-embedded axes".into(), 0.5);
+    (manifest.encoder.name, manifest.encoder.default_threshold) = ("axes".into(), 0.5);
     manifest
 }
 

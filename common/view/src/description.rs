@@ -131,11 +131,8 @@ pub struct Words {
     pub complete: bool,
 }
 
-/// Confidence from which a name is more likely right than wrong; others are not offered.
-const LIKELY: f32 = 0.5;
-
 impl Words {
-    /// Counts things by their best names, each with its confidence, if [`LIKELY`]; adds the other words of a
+    /// Counts things by their best names, each with its confidence; adds the other words of a
     /// `vocabulary`. Ordered by the expected number of things: the sum of confidences.
     pub fn new<'a>(
         generation: u64,
@@ -143,7 +140,7 @@ impl Words {
         vocabulary: &[String],
     ) -> Self {
         let mut counts: BTreeMap<&str, (f32, usize)> = BTreeMap::new();
-        for (name, confidence) in best.into_iter().filter(|(_, confidence)| *confidence >= LIKELY) {
+        for (name, confidence) in best {
             let (expected, n_things) = counts.entry(name).or_default();
             (*expected, *n_things) = (*expected + confidence, *n_things + 1);
         }
@@ -165,7 +162,7 @@ impl Words {
 pub struct Word {
     /// The word, or phrase.
     pub word: String,
-    /// Things that are likely called so.
+    /// Things whose best name it is.
     pub n_things: usize,
 }
 
@@ -185,12 +182,11 @@ mod tests {
 
     #[test]
     fn likely_names_come_first_and_words_of_no_thing_last() {
-        let best =
-            [("mug", 0.6), ("crib", 0.5), ("chair", 0.9), ("crib", 0.6), ("flute", 0.49), ("chair", 0.3)];
-        let vocabulary = ["lamp", "mug", "flute"].map(str::to_owned);
+        let best = [("mug", 0.4), ("crib", 0.1), ("chair", 0.9), ("crib", 0.2), ("crib", 0.05)];
+        let vocabulary = ["lamp", "mug", "sofa"].map(str::to_owned);
         let words = Words::new(7, best, &vocabulary);
         let found: Vec<(&str, usize)> = words.words.iter().map(|of| (&*of.word, of.n_things)).collect();
-        assert_eq!(found, [("crib", 2), ("chair", 1), ("mug", 1), ("lamp", 0), ("flute", 0)]);
+        assert_eq!(found, [("chair", 1), ("mug", 1), ("crib", 3), ("lamp", 0), ("sofa", 0)]);
         assert!(words.complete && words.generation == 7 && !Words::pending(7).complete);
     }
 }

@@ -340,7 +340,7 @@ async fn tells_status_and_metrics() {
     let scene = &status["scene"];
     assert_eq!(
         (&scene["n_gaussians"], &scene["encoder_name"], &scene["metric"]),
-        (&20.into(), &"slag-embedded axes".into(), &true.into())
+        (&20.into(), &"axes".into(), &true.into())
     );
     assert_eq!((&scene["shards"][0]["cell_id"], &scene["radius"]), (&1.into(), &50.0.into()));
     let (_, headers, metrics) = service.get("/metrics").await;
