@@ -38,7 +38,7 @@ const MIN_SPREAD: f64 = 0.04;
 /// Largest angle between stated direction of gravity and that of the pose: 10 degrees.
 const MAX_GRAVITY_ANGLE: f64 = 0.175;
 
-/// A photo, and what is known about it.
+/// A photo with its camera; gravity and a prior where they are known.
 #[derive(Clone, Copy, Debug)]
 pub struct Photo<'a> {
     pub grey: &'a Grey,
@@ -178,8 +178,8 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Returns poses by number of inliers: from matches with all landmarks and with those of a few views and,
-    /// unless these suffice, with single places, of which two may look alike.
+    /// Returns distinct poses, most inliers first. Matches with all landmarks and with those of a few views are tried;
+    /// if the first give too few inliers, also matches with single places, because two places may look alike.
     fn proposals(&self) -> Vec<Agreed> {
         let agreed = |matches: &[Match]| ransac(&self.camera, matches, SEED);
         let all = self.query.match_all(self.map);

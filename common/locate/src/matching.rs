@@ -13,7 +13,7 @@ const MAX_DISTANCE: u32 = 40;
 const MAX_RATIO: f32 = 0.8;
 /// The same among the landmarks of a few views, where fewer are similar by chance.
 const MAX_RATIO_OF_VIEWS: f32 = 0.9;
-/// Largest difference in bits where the pose says which landmark it is.
+/// Largest descriptor distance, bits, to a landmark that the pose predicts.
 const MAX_GUIDED_DISTANCE: u32 = 44;
 /// Radius around a feature within which its landmark lies, given the pose, pixels.
 const GUIDED_PX: f64 = 12.0;

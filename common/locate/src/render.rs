@@ -17,7 +17,7 @@ const MAX_RATIO: f32 = 0.9;
 /// Largest relative depth step between neighbouring pixels of a surface.
 const MAX_DEPTH_STEP: f32 = 0.05;
 
-/// Least opacity of a pixel whose depth is that of a surface.
+/// Opacity from which a pixel shows a surface.
 const MIN_COVERAGE: f32 = 0.5;
 /// An image of the scene, with the camera z of each pixel; 0 where there is no surface.
 pub struct Rendering {

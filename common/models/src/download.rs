@@ -142,7 +142,7 @@ impl DownloadFailure {
         }
     }
 
-    /// Whether the message says what to do.
+    /// Whether the message already gives advice.
     pub fn has_advice(&self) -> bool {
         matches!(self, Self::Tls { .. } | Self::NotHttp { .. } | Self::Redirect { .. })
     }
@@ -233,7 +233,8 @@ impl Expected {
         bytes
     }
 
-    /// Refuses a file of `total` bytes, if known, of which `rest` are missing and `content` announced.
+    /// Refuses a file whose `total` bytes are not as expected, or whose missing `rest` is not the announced `content`;
+    /// unknown lengths pass.
     fn check(
         self,
         total: Option<u64>,

@@ -25,8 +25,8 @@ pub struct Tiles {
 /// A key that sorts near to far, and the columns `first..=last` of tiles in a row.
 type Candidate = (u64, (u32, u32));
 
-/// Lists for every tile the Gaussians whose footprint may contain one of its pixel centres, by camera z as `f32`;
-/// ties are broken by index.
+/// Lists, for each tile, the Gaussians whose footprint may cover one of its pixel centres, sorted by camera z as `f32`,
+/// then by index.
 pub fn bin(visible: &[ScreenGaussian], camera: &Intrinsics) -> Tiles {
     let (width_px, height_px) = (camera.width_px, camera.height_px);
     let n_rows = height_px.div_ceil(TILE) as usize;

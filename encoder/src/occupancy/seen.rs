@@ -14,7 +14,7 @@ pub(crate) const MIN_VIEWS: u32 = 2;
 pub(super) const DEPTH_WIDTH_PX: u32 = 320;
 /// Height above an occupied voxel up to which places are examined, world units: a robot with its load.
 const HEADROOM: f64 = 2.4;
-/// Least opacity of a pixel whose depth is a surface's.
+/// Opacity from which a pixel shows a surface.
 const MIN_COVERAGE: f32 = 0.5;
 /// Largest opacity of a pixel with nothing in its way.
 const MAX_SKY: f32 = 0.1;
