@@ -68,7 +68,7 @@ pub fn text_of(bytes: &[u8]) -> Result<&str, NotUtf8> {
 
 /// Checks that a file can be written, before the work for its content.
 pub fn check_writable(path: &Path) -> io::Result<()> {
-    match fs_err::metadata(path) {
+    match metadata(path) {
         // A pipe would wait for its reader.
         Ok(about) if !about.is_file() && !about.is_dir() => Ok(()),
         Ok(_) => fs_err::OpenOptions::new().append(true).open(path).map(drop),

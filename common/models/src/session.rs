@@ -14,6 +14,7 @@ use ort::value::{
     DynTensor, DynTensorValueType, DynValue, Outlet, PrimitiveTensorElementType, Tensor as OwnedTensor,
     TensorElementType, TensorRef, ValueType,
 };
+use slag_common::files;
 
 use crate::file_ref::ModelFile;
 use crate::floats::Floats;
@@ -108,7 +109,7 @@ impl Model {
         let path = &*file.path;
         // Checked before the library is loaded, so that a missing model is reported as such.
         if file.embedded.is_none() {
-            fs_err::metadata(path).map_err(|cause| SessionError::Read { cause })?;
+            files::metadata(path).map_err(|cause| SessionError::Read { cause })?;
         }
         let environment = environment(&options.runtime)?;
         let mut wanted = options.providers.clone();

@@ -114,7 +114,7 @@ fn read_matrix(path: &Path) -> Result<Matrix, PoseError> {
     file.take(MAX_MATRIX_BYTES + 1).read_to_end(&mut bytes)?;
     let fail = |problem: PoseProblem, place| Err(problem.at(path, place));
     if bytes.len() as u64 > MAX_MATRIX_BYTES {
-        let bytes = fs_err::metadata(path)?.len();
+        let bytes = files::metadata(path)?.len();
         let expected = "the text of one 4 x 4 matrix";
         return fail(PoseProblem::TooLarge { bytes, most: MAX_MATRIX_BYTES, expected }, Place::File);
     }

@@ -56,7 +56,7 @@ impl SplatFrame {
         files::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
         let fail = |problem: PoseProblem| problem.at(path, Place::File);
         if bytes.len() as u64 > MAX_BYTES {
-            let bytes = fs_err::metadata(path)?.len();
+            let bytes = files::metadata(path)?.len();
             return Err(fail(PoseProblem::TooLarge { bytes, most: MAX_BYTES, expected: FRAME_FILE }));
         }
         let text = files::text_of(&bytes).map_err(|fault| fail(PoseProblem::NotUtf8(fault)))?;

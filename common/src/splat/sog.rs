@@ -125,12 +125,12 @@ impl Pixels {
 
 pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let folder = meta_path.parent().unwrap_or(Path::new("")).to_path_buf();
-    let len_bytes = fs_err::metadata(meta_path)?.len();
+    let len_bytes = files::metadata(meta_path)?.len();
     let name = meta_path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let mut sog = Sog { path: meta_path.into(), parts: Parts::Folder(folder), len_bytes };
     let meta = sog.meta(&name)?;
     for file in meta.files() {
-        sog.len_bytes += fs_err::metadata(sog.path_in_folder(file)?)?.len();
+        sog.len_bytes += files::metadata(&sog.path_in_folder(file)?)?.len();
     }
     sog.decode(&meta, options)
 }

@@ -7,7 +7,7 @@ use slag_common::objects::{parse_public_id, public_id};
 use super::choose::choose;
 use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings};
-use crate::query::{AnswerKind, Ask, Engine, OnBoard, Outcome, Point};
+use crate::query::{Ask, ClusterAnswer, Engine, Found, OnBoard, Outcome, Point};
 use crate::score::Budget;
 
 const MAX_THINGS: usize = 5;
@@ -26,9 +26,6 @@ pub fn find(
     request.check()?;
     let snapshot = &on_board.snapshot;
     let manifest = &snapshot.manifest;
-    if snapshot.objects.is_empty() {
-        return Err(GoalError::NoObjects);
-    }
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
     let things = match things(engine, on_board, request, near, budget)? {
         Ok(things) => things,
@@ -51,8 +48,11 @@ pub fn find(
         return Ok(reply);
     };
     let mut around = seen.around(start);
-    for (id, thing) in things {
-        let points = engine.object_points(snapshot, id, MAX_POINTS, budget);
+    for (shape, thing) in things {
+        let points = match shape {
+            Shape::Object(id) => engine.object_points(snapshot, id, MAX_POINTS, budget),
+            Shape::Group(group) => engine.answer_points(snapshot, &group, MAX_POINTS, budget),
+        };
         budget.check().map_err(GoalError::spent)?;
         let chosen = choose(&mut around, request, &points);
         // Looks end early once the budget is spent.
@@ -92,7 +92,14 @@ fn detail(missed: &MissedThing, request: &GoalRequest) -> String {
     }
 }
 
-type Things = Vec<(u64, TargetThing)>;
+/// What a thing's surface is taken from.
+enum Shape {
+    Object(u64),
+    /// Gaussians that match a text, where no object does.
+    Group(Box<ClusterAnswer>),
+}
+
+type Things = Vec<(Shape, TargetThing)>;
 
 /// Returns the things to go to, best first, or why there is none.
 fn things(
@@ -104,45 +111,45 @@ fn things(
 ) -> Result<Result<Things, String>, GoalError> {
     let text = match &request.target {
         GoalTarget::Object(id) => {
+            if on_board.snapshot.objects.is_empty() {
+                return Err(GoalError::NoObjects);
+            }
             let Some(object) = engine.object(&on_board.snapshot, None, *id, budget)? else {
                 let generation = on_board.snapshot.manifest.generation;
                 return Ok(Err(format!("generation {generation} has no object {} on board", public_id(*id))));
             };
             let thing =
                 TargetThing { id: object.id, position_in_world: object.position_in_world, score: None };
-            return Ok(Ok(vec![(*id, thing)]));
+            return Ok(Ok(vec![(Shape::Object(*id), thing)]));
         }
         GoalTarget::Text(text) => text,
     };
     let near = Some(Point::World(near.to_array()));
-    // Clusters have no id to go to.
-    let kind = Some(AnswerKind::Objects);
     let (texts, heading_rad) = (vec![text.clone()], request.heading_rad);
-    let ask = Ask { texts, near, heading_rad, kind, limit: Some(MAX_THINGS), ..Ask::default() };
-    let found = engine.ask_on(on_board, ask, budget)?;
-    let thing = |answer: &crate::query::ClusterAnswer| {
+    let ask = Ask { texts, near, heading_rad, limit: Some(MAX_THINGS), ..Ask::default() };
+    let found = engine.ask_for_members(on_board, ask, budget)?;
+    let (answers, none) = match found.outcomes.into_iter().next() {
+        Some(Outcome::Plain(plain)) => {
+            let Found::Clusters(answers) = plain.answers else { return Ok(Ok(Vec::new())) };
+            (answers, plain.reason.map(|reason| reason.detail))
+        }
+        Some(Outcome::Related(related)) => {
+            let answers = related.answers.into_iter().map(|(answer, ..)| answer).collect();
+            (answers, related.miss.map(|miss| miss.detail))
+        }
+        None => (Vec::new(), None),
+    };
+    if answers.is_empty() {
+        return Ok(Err(none.unwrap_or_else(|| "nothing on board matches".to_owned())));
+    }
+    let thing = |answer: ClusterAnswer| {
         let thing = TargetThing {
             id: answer.id.clone(),
             position_in_world: answer.position_in_world,
             score: Some(answer.score),
         };
-        Some((parse_public_id(&answer.id)?, thing))
+        let shape = parse_public_id(&answer.id).map_or_else(|| Shape::Group(Box::new(answer)), Shape::Object);
+        (shape, thing)
     };
-    let (things, none): (Things, Option<&str>) = match found.outcomes.first() {
-        Some(Outcome::Plain(answers)) => {
-            let crate::query::Found::Clusters(clusters) = &answers.answers else { return Ok(Ok(Vec::new())) };
-            let none = answers.reason.as_ref().map(|reason| reason.detail.as_str());
-            (clusters.iter().filter_map(thing).take(MAX_THINGS).collect(), none)
-        }
-        Some(Outcome::Related(related)) => {
-            let none = related.miss.as_ref().map(|miss| miss.detail.as_str());
-            (related.answers.iter().filter_map(|(of, ..)| thing(of)).take(MAX_THINGS).collect(), none)
-        }
-        None => (Vec::new(), None),
-    };
-    Ok(if things.is_empty() {
-        Err(none.unwrap_or("nothing on board matches").to_owned())
-    } else {
-        Ok(things)
-    })
+    Ok(Ok(answers.into_iter().take(MAX_THINGS).map(thing).collect()))
 }

@@ -22,14 +22,22 @@ const CANDIDATES_BYTES: usize = 256 << 10;
 impl Engine {
     /// Answers questions from the loaded generation. Blocks for milliseconds of computing, within the budget's time.
     pub fn ask(&self, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
-        self.ask_on(&self.on_board()?, ask, budget)
-    }
-
-    /// As [`Engine::ask`], from a generation that may already be replaced.
-    pub(crate) fn ask_on(&self, on_board: &OnBoard, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
+        let on_board = self.on_board()?;
         on_board.check()?;
         let request = ask.understand(&on_board.snapshot)?;
-        self.answer_on(on_board, request, budget)
+        self.answer_on(&on_board, request, budget)
+    }
+
+    /// As [`Engine::ask`], from a generation that may already be replaced, and with the Gaussians of each answer.
+    pub(crate) fn ask_for_members(
+        &self,
+        on_board: &OnBoard,
+        ask: Ask,
+        budget: &Budget,
+    ) -> Result<Reply, QueryError> {
+        on_board.check()?;
+        let request = ask.understand(&on_board.snapshot)?;
+        self.answer_on(on_board, QueryRequest { members: true, ..request }, budget)
     }
 
     /// As [`Engine::ask`], for a request already in the world frame.

@@ -12,6 +12,7 @@ use slag_api::objects::{MAX_NAMES, ObjectOnBoard, ObjectPage, OrientedBox};
 use slag_common::frames::Aabb;
 use slag_common::objects::public_id;
 
+use super::answers::ClusterAnswer;
 use super::cluster::{Grouping, cluster};
 use super::engine::{Engine, OnBoard, QueryError};
 use super::names::Names;
@@ -114,11 +115,37 @@ impl Engine {
             if !take_points(scene, object, budget) {
                 return Vec::new();
             }
-            let points: Vec<DVec3> = largest_cluster(scene, object);
-            let step = points.len().div_ceil(limit.max(1)).max(1);
-            points.into_iter().step_by(step).collect()
+            thinned(largest_cluster(scene, object), limit)
         })
     }
+
+    /// As [`Engine::object_points`], of an answer that lists its members.
+    pub(crate) fn answer_points(
+        &self,
+        snapshot: &Snapshot,
+        answer: &ClusterAnswer,
+        limit: usize,
+        budget: &Budget,
+    ) -> Vec<DVec3> {
+        self.on_scene(snapshot, budget, |_, scene| {
+            if !budget.take(answer.n_gaussians as usize * size_of::<DVec3>()) {
+                return Vec::new();
+            }
+            let bounds = Aabb { min: answer.box_min_in_world, max: answer.box_max_in_world };
+            thinned(points_of(scene, &answer.members, &bounds), limit)
+        })
+    }
+}
+
+fn points_of(scene: &Scene<'_>, members: &[Run], bounds: &Aabb) -> Vec<DVec3> {
+    let point = |run: &Run, index: u32| scene.shards[run.shard as usize].position_in_world(index as usize);
+    let all = members.iter().flat_map(|run| (run.start..run.end).map(move |index| point(run, index)));
+    all.filter(|point| bounds.contains(*point)).collect()
+}
+
+fn thinned(points: Vec<DVec3>, limit: usize) -> Vec<DVec3> {
+    let step = points.len().div_ceil(limit.max(1)).max(1);
+    points.into_iter().step_by(step).collect()
 }
 
 /// Charges the memory for the positions of an object's Gaussians; returns whether the work may go on.
@@ -140,9 +167,7 @@ pub(super) fn largest_cluster(scene: &Scene<'_>, object: usize) -> Vec<DVec3> {
     let Some(largest) = clusters.into_iter().max_by_key(|of| (of.n_gaussians, Reverse(of.first))) else {
         return Vec::new();
     };
-    let point = |run: &Run, index: u32| scene.shards[run.shard as usize].position_in_world(index as usize);
-    let all = largest.members.iter().flat_map(|run| (run.start..run.end).map(move |index| point(run, index)));
-    all.filter(|point| largest.extent.box_in_world.contains(*point)).collect()
+    points_of(scene, &largest.members, &largest.extent.box_in_world)
 }
 
 fn number_of(scene: &Scene<'_>, id: u64) -> Option<usize> {

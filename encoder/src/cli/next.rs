@@ -22,23 +22,23 @@ const PORT: u16 = 7733;
 
 /// Lines for a published store: extent, `query` and `serve` here, `trust` and `fetch` on the robot.
 pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
+    let reader = StoreReader::open(store)?;
     let here = shell_word(store);
     // The page knows no --activated.
     let shown = if input.activated == Activated::default() { of_input(input) } else { String::new() };
     let mut lines = String::from("\nnext\n");
-    writeln!(lines, "  slag-encoder query --store {here} {}", example(&StoreReader::open(store)?))?;
+    writeln!(lines, "  slag-encoder query --store {here} {}", example(&reader))?;
     writeln!(lines, "  slag-encoder view --store {here}{shown}")?;
     writeln!(lines, "  slag-encoder serve --store {here} --listen 0.0.0.0:{PORT}")?;
-    Ok(lines + &of_robot(store, &format!("http://0.0.0.0:{PORT}"))?)
+    Ok(lines + &of_robot(&reader, &format!("http://0.0.0.0:{PORT}"))?)
 }
 
 /// Lines for a robot, with the extent it can fetch. `url`: where the store is served.
-pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
-    let reader = StoreReader::open(store)?;
+pub(super) fn of_robot(reader: &StoreReader, url: &str) -> Result<String> {
     let manifest = reader.manifest();
-    let root = MetadataReader::new(store).root_sha256()?;
+    let root = MetadataReader::new(reader.dir()).root_sha256()?;
     let boxes: Vec<(Aabb, f64)> = (manifest.cells.iter())
-        .map(|cell| (mean_box(&reader, cell).unwrap_or(cell.bounds), f64::from(cell.n_gaussians)))
+        .map(|cell| (mean_box(reader, cell).unwrap_or(cell.bounds), f64::from(cell.n_gaussians)))
         .collect();
     let (extent, at) = extent_and_place(&boxes);
     let unit = if manifest.metric { "m" } else { "world units" };
@@ -47,7 +47,7 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
     let mut lines = String::from("on the robot\n");
     writeln!(lines, "  slag-edge trust add {base} --sha256 {root}")?;
     writeln!(lines, "  slag-edge fetch --from {base} --at {:.2},{:.2},{:.2} --radius 50", at.x, at.y, at.z)?;
-    writeln!(lines, "  slag-edge query {}", example(&reader))?;
+    writeln!(lines, "  slag-edge query {}", example(reader))?;
     writeln!(
         lines,
         "The scene is {:.1} x {:.1} x {:.1} {unit}, from {} to {} without strays.",

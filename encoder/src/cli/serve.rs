@@ -14,6 +14,7 @@ use super::common::{Exit, ModelArgs, runtime, stopped, warn_of_expiry};
 use super::next;
 use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
+use crate::store::StoreReader;
 use crate::view::{self, Viewed, Viewer};
 
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(86_400);
@@ -68,7 +69,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
         let listening = |url: String| {
             let _ = writeln!(io::stdout(), "listening on {url}");
             if tracing::enabled!(tracing::Level::INFO)
-                && let Ok(lines) = next::of_robot(&args.store, &url)
+                && let Ok(store) = StoreReader::open(&args.store)
+                && let Ok(lines) = next::of_robot(&store, &url)
             {
                 note(lines.trim_end());
             }

@@ -73,7 +73,7 @@ impl Stamp {
     }
 
     fn of(path: &Path) -> io::Result<Self> {
-        let metadata = fs_err::metadata(path)?;
+        let metadata = slag_common::files::metadata(path)?;
         let inode = std::os::unix::fs::MetadataExt::ino(&metadata);
         Ok(Self { modified: metadata.modified().ok(), len_bytes: metadata.len(), inode })
     }

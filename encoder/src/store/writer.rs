@@ -257,7 +257,7 @@ impl Store {
         let is_read = self.read.lock().unwrap_or_else(PoisonError::into_inner).contains(&hash);
         let found = match is_read {
             // Written or read by this writer: only its presence is in question.
-            true => fs_err::metadata(&path).map(|found| (hash, found.len())),
+            true => slag_common::files::metadata(&path).map(|found| (hash, found.len())),
             false => files::hash_of(&path),
         };
         match found {

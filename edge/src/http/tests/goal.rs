@@ -3,7 +3,7 @@
 use slag_common::occupancy::{Block, BuiltOccupancy};
 
 use super::openapi::{check, description};
-use super::v1::room_with;
+use super::v1::{room_of, room_with};
 use super::*;
 
 /// Occupancy of the room: a floor from -1 to 5 m along x and to 4 m along y, and the boxes of two mugs and a table.
@@ -90,6 +90,25 @@ async fn poses_or_reasons_are_given() {
     let (_, _, away) = service.get("/v1/goal?text=0&near=20,3,0&step_m=0.15").await;
     assert_eq!(away["none"]["kind"], "unknown-ground", "{away:#}");
     assert_refused(&service.get("/v1/goal?near=2,3,0").await, "text", "nothing");
+}
+
+/// The table is no object, but its Gaussians answer: the robot goes to what a query finds.
+#[tokio::test]
+async fn groups_of_gaussians_are_gone_to() {
+    let service = Service::new(Some(&room_of(2, Some(&places()))), Settings::default());
+    let (_, _, found) = service.get("/v1/query?text=1").await;
+    let id = &found["results"][0]["answers"][0]["id"];
+    assert!(id.as_str().is_some_and(|id| !id.starts_with('o')), "{found:#}");
+    let (status, _, body) = service.get("/v1/goal?text=1&near=2,3,0&step_m=0.15").await;
+    assert_eq!(status, StatusCode::OK, "{body:#}");
+    is_as_described("/v1/goal", &body);
+    assert_eq!((&body["thing"]["id"], body["none"].is_null()), (id, true), "{body:#}");
+    let goal = &body["goals"][0];
+    let at = |axis: usize| goal["position_in_world"][axis].as_f64().expect("a number");
+    // The table's top is 1.6 by 0.9 m, from the origin.
+    let distance = (at(0) - at(0).clamp(0.0, 1.6)).hypot(at(1) - at(1).clamp(0.0, 0.9));
+    assert!((0.3..0.9).contains(&distance), "{body:#}");
+    assert!(goal["visible_share"].as_f64() > Some(0.1), "{body:#}");
 }
 
 /// By hand: 6 by 5 m of seen floor in cells of 0.1 m, the table and the floor's mug in it.

@@ -32,6 +32,11 @@ fn room() -> [BuiltShard; 1] {
 
 /// The same, with occupancy.
 pub(super) fn room_with(places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
+    room_of(3, places)
+}
+
+/// The room with its first objects alone.
+pub(super) fn room_of(n_objects: usize, places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
     let mugs = [
         lattice([50, 40, 75], [60, 50, 88], [4, 4, 4], 0),
         lattice([300, 40, 0], [310, 50, 13], [4, 4, 4], 0),
@@ -46,7 +51,7 @@ pub(super) fn room_with(places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
         n_gaussians: ends[at + 1] - ends[at],
     };
     let objects = [object(1, 0, 0), object(2, 0, 1), object(3, 1, 2)];
-    [shard.with_objects_and_places(&objects, CALIBRATION, places)]
+    [shard.with_objects_and_places(&objects[..n_objects], CALIBRATION, places)]
 }
 
 async fn post(service: &Service, body: &Value) -> Answered {
