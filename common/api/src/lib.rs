@@ -1,6 +1,7 @@
 //! Replies of the robot's HTTP interface, version 1, for the service, the doors and the description.
 
 pub mod changes;
+pub mod coverage;
 pub mod floor;
 pub mod goal;
 pub mod locate;

@@ -6,6 +6,7 @@ use glam::{DQuat, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::coverage::Coverage;
 use crate::{FRAME, Geographic, UNITS};
 
 pub const MAX_NAMES: usize = 3;
@@ -66,6 +67,8 @@ pub struct ObjectPage {
     pub n_objects: usize,
     /// `after` of the next page; null if there is none.
     pub next_after: Option<String>,
+    #[serde(flatten)]
+    pub coverage: Coverage,
     /// The objects, in the order asked for.
     pub objects: Vec<ObjectOnBoard>,
 }

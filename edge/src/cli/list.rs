@@ -93,6 +93,9 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
 fn print_page(page: &ObjectPage) -> Result<(), Failure> {
     let ObjectPage { n_objects, scene, generation, unit, .. } = page;
     let listed = page.objects.len();
+    if let Some(missing) = page.coverage.missing() {
+        note(missing);
+    }
     note(format_args!(
         "{listed} of {n_objects} things of {}, generation {generation}; in per cent: the chance of a name",
         visible(scene)

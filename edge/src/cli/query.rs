@@ -4,12 +4,13 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use crate::query::{
-    AnswerKind, Answers, BadCellAnswer, ClusterAnswer, DEFAULT_MIN_COUNT, Format, Found, GaussianAnswer,
-    Negatives, QueryRequest, Reply, Searched, ThresholdSource, parse_box, parse_point,
+    AnswerKind, Answers, ClusterAnswer, DEFAULT_MIN_COUNT, Format, Found, GaussianAnswer, Negatives,
+    QueryRequest, Reply, Searched, ThresholdSource, parse_box, parse_point,
 };
 use crate::score::{Ball, Budget, Precision, Region};
 use clap::Args;
 use glam::DVec3;
+use slag_api::coverage::BadCellAnswer;
 use slag_common::frames::Aabb;
 use slag_common::{durable, files, note};
 
@@ -129,7 +130,7 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
         note(&reason.detail);
         return Ok(());
     }
-    note(notes(&answers.searched).trim_end());
+    note(notes(answers).trim_end());
     let row = |rank: usize, at: DVec3, of: [String; 4], from: Option<f64>| {
         let [size, score, count, id] = of;
         let distance = from.map_or_else(|| "-".to_owned(), |d| format!("{d:.2}"));
@@ -157,7 +158,8 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
 }
 
-fn notes(found: &Searched) -> String {
+fn notes(answers: &Answers) -> String {
+    let found = &answers.searched;
     let exactness = match found.score_error_likely.filter(|_| !found.is_exact) {
         Some(likely) => format!("; 99 of 100 scores within ±{likely:.3}"),
         None => String::new(),
@@ -171,15 +173,13 @@ fn notes(found: &Searched) -> String {
     let Searched { n_matching, n_searched, threshold, .. } = found;
     let mut notes =
         format!("{n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}\n");
-    if found.area_fetched == Some(false) {
-        notes += "part of that area is not on board; fetch it for a complete answer\n";
+    if let Some(missing) = answers.coverage.missing() {
+        notes += &format!("{missing}\n");
     }
-    for BadCellAnswer { cell_id, generation } in &found.bad_cells {
-        let instead = match generation {
-            Some(old) => format!("; generation {old} answers for it"),
-            None => ", and is not on board".to_owned(),
-        };
-        notes += &format!("cell {cell_id} could not be fetched{instead}\n");
+    for BadCellAnswer { cell_id, generation } in &answers.coverage.bad_cells {
+        if let Some(old) = generation {
+            notes += &format!("cell {cell_id} could not be fetched; generation {old} answers for it\n");
+        }
     }
     notes
 }

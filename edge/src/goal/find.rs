@@ -7,8 +7,9 @@ use slag_common::objects::{parse_public_id, public_id};
 use super::choose::choose;
 use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings};
-use crate::query::{Ask, ClusterAnswer, Engine, Found, OnBoard, Outcome, Point};
-use crate::score::Budget;
+use crate::query::{Ask, ClusterAnswer, Engine, Found, OnBoard, Outcome, Point, coverage};
+use crate::score::{Budget, Region};
+use crate::store::Snapshot;
 
 const MAX_THINGS: usize = 5;
 const MAX_POINTS: usize = 4096;
@@ -116,7 +117,12 @@ fn things(
             }
             let Some(object) = engine.object(&on_board.snapshot, None, *id, budget)? else {
                 let generation = on_board.snapshot.manifest.generation;
-                return Ok(Err(format!("generation {generation} has no object {} on board", public_id(*id))));
+                let Snapshot { manifest, bad_cells, current, .. } = &*on_board.snapshot;
+                let fetched = (current.centre_in_world, current.radius);
+                let missing = coverage(manifest, bad_cells, fetched, &Region::default()).missing();
+                let missing = missing.map(|missing| format!("; {missing}")).unwrap_or_default();
+                let id = public_id(*id);
+                return Ok(Err(format!("generation {generation} has no object {id} on board{missing}")));
             };
             let thing =
                 TargetThing { id: object.id, position_in_world: object.position_in_world, score: None };

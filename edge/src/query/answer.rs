@@ -5,8 +5,9 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Found, Searched, Whole};
+use super::answers::{Answers, ClusterAnswer, Clustering, Found, Searched, Whole};
 use super::cluster::{Cluster, Clusters, Grouping, cluster};
+use super::coverage::coverage;
 use super::objects::{self, FoundObject, ScoredObjects};
 use super::oriented::Extent;
 use super::rank::{Order, Ranked};
@@ -19,7 +20,6 @@ use super::scene::{Scene, alignment, default_voxel, unit};
 use crate::score::{
     Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Scratch, Search, score_objects,
 };
-use crate::store::{BadCell, cell_of};
 use slag_common::manifest::Manifest;
 
 /// Names of the questions, and their vectors, each with its negatives.
@@ -51,8 +51,11 @@ pub(super) struct Answering<'a> {
 impl Answering<'_> {
     fn answers(&self, scratch: &mut Scratch, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
         let mut answers = self.found(scratch, asked)?;
-        let reasons = answers.iter_mut().filter_map(|answers| answers.reason.as_mut());
-        reasons.for_each(|reason| reason::add_seen(reason, self.scene.shards, &self.request.region));
+        for Answers { reason, coverage, .. } in &mut answers {
+            if let Some(reason) = reason {
+                reason::complete(reason, self.scene.shards, &self.request.region, coverage);
+            }
+        }
         Ok(answers)
     }
 
@@ -148,14 +151,13 @@ impl Answering<'_> {
         });
         let found = Found::Clusters(described.collect());
         let empty = self.empty((text, AnswerKind::Objects), scale, threshold);
-        let area_fetched = empty.searched.area_fetched;
         let reason = || {
             let best = ScoredObjects { min_count: 1, ..objects }.best().map(|best| BestObject {
                 score: scale.shown(best.score),
                 reaches: best.score >= of_score,
                 position_in_world: best.extent().position_in_world,
             });
-            reason::of_objects(scene, request, threshold.0, best, area_fetched)
+            reason::of_objects(scene, request, threshold.0, best)
         };
         Answers {
             searched: Searched {
@@ -189,9 +191,7 @@ impl Answering<'_> {
         let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
         let measured = search.measured_errors();
         let empty = self.empty(asked, scale, (threshold, source));
-        let area_fetched = empty.searched.area_fetched;
-        let reason =
-            || reason::of_gaussians(search, scale, self.request, threshold, n_matching, area_fetched);
+        let reason = || reason::of_gaussians(search, scale, self.request, threshold, n_matching);
         Answers {
             searched: Searched {
                 n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
@@ -285,12 +285,17 @@ impl Answering<'_> {
             answers.iter().map(|answer| answer.n_gaussians).sum(),
         );
         let searched = Searched { n_searched, n_matching, ..empty.searched };
-        Answers { searched, reason: related.miss, answers: Found::Clusters(answers), ..empty }
+        Answers {
+            searched,
+            coverage: related.coverage,
+            reason: related.miss,
+            answers: Found::Clusters(answers),
+            ..empty
+        }
     }
 
     fn empty(&self, asked: (&str, AnswerKind), scale: Scale, threshold: (f32, ThresholdSource)) -> Answers {
         let (manifest, request) = (self.scene.manifest, self.request);
-        let bad_cells = bad_cells(self.scene, &request.region);
         let searched = Searched {
             negatives: request.negatives.0.clone(),
             score_kind: scale.0,
@@ -301,9 +306,6 @@ impl Answering<'_> {
             is_exact: false,
             score_error_bound: 0.0,
             score_error_likely: None,
-            area_fetched: area_fetched(self.scene.fetched, request)
-                .map(|is_fetched| is_fetched && bad_cells.iter().all(|bad| bad.generation.is_some())),
-            bad_cells,
             clustering: None,
         };
         Answers {
@@ -313,6 +315,7 @@ impl Answering<'_> {
             generation: manifest.generation,
             unit: unit(manifest),
             searched,
+            coverage: coverage(manifest, self.scene.bad_cells, self.scene.fetched, &request.region),
             asked_as: BTreeMap::new(),
             reason: None,
             answers: Found::Clusters(Vec::new()),
@@ -324,22 +327,6 @@ impl Answering<'_> {
 fn n_with_evidence(scene: &Scene<'_>, region: &Region) -> u64 {
     let shards = scene.shards.iter().filter(|shard| region.touches(&shard.position_box()));
     shards.map(|shard| shard.n_with_evidence() as u64).sum()
-}
-
-fn bad_cells(scene: &Scene<'_>, region: &Region) -> Vec<BadCellAnswer> {
-    let touches =
-        |bad: &&BadCell| cell_of(scene.manifest, bad.cell_id).is_none_or(|cell| region.touches(&cell.bounds));
-    let generation = |bad: &BadCell| bad.old.map(|old| old.generation);
-    let described = |bad: &BadCell| BadCellAnswer { cell_id: bad.cell_id, generation: generation(bad) };
-    scene.bad_cells.iter().filter(touches).map(described).collect()
-}
-
-/// Returns whether the whole region was fetched: surely if all of ball or box was, as their intersection counts.
-fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Option<bool> {
-    let region = &request.region;
-    let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);
-    let bounds = region.bounds.map(|b| (b.min - centre).abs().max((b.max - centre).abs()).length() <= radius);
-    ball.into_iter().chain(bounds).reduce(|a, b| a || b)
 }
 
 pub(super) fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {

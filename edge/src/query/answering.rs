@@ -7,6 +7,7 @@ use slag_service::params::RequestError;
 
 use super::answer::{Answering, answer, cluster_answer, object_answer};
 use super::ask::Ask;
+use super::coverage::coverage;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::rank::Ranked;
 use super::reason;
@@ -165,6 +166,7 @@ fn related(
     }
     let metre = relations::metre(scene.manifest);
     let parts = things.found();
+    let coverage = coverage(scene.manifest, scene.bad_cells, scene.fetched, &request.region);
     let viewer =
         request.near.map(|position_in_world| Viewer { position_in_world, heading_rad: request.heading_rad });
     let found = match relations::relate(&things, phrase, viewer.as_ref(), metre) {
@@ -172,13 +174,9 @@ fn related(
         Err(mut miss) => {
             let part = parts.iter().find(|part| Some(&*part.thing) == miss.thing.as_deref());
             miss.best_score = part.and_then(|part| part.best_score);
-            reason::add_seen(&mut miss, scene.shards, &request.region);
-            return Ok(RelatedAnswers {
-                asked_as: BTreeMap::new(),
-                parts,
-                miss: Some(miss),
-                answers: Vec::new(),
-            });
+            reason::complete(&mut miss, scene.shards, &request.region, &coverage);
+            let (asked_as, answers) = Default::default();
+            return Ok(RelatedAnswers { asked_as, parts, coverage, miss: Some(miss), answers });
         }
     };
     let of = things.of(&phrase.thing);
@@ -197,7 +195,8 @@ fn related(
         };
         (answer, related.degree, related.to)
     });
-    Ok(RelatedAnswers { asked_as: BTreeMap::new(), parts, miss: None, answers: described.collect() })
+    let (asked_as, miss, answers) = (BTreeMap::new(), None, described.collect());
+    Ok(RelatedAnswers { asked_as, parts, coverage, miss, answers })
 }
 
 fn needs_up(phrase: &Phrase) -> bool {

@@ -7,6 +7,7 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use serde::ser::{SerializeSeq, Serializer};
 use slag_api::UNITS;
+use slag_api::coverage::Coverage;
 use slag_api::objects::{Evidence, OrientedBox};
 use slag_common::frames::Geographic;
 use slag_common::shard::ShardView;
@@ -31,6 +32,8 @@ pub struct Answers {
     pub unit: &'static str,
     #[serde(flatten)]
     pub searched: Searched,
+    #[serde(flatten)]
+    pub coverage: Coverage,
     /// What was asked in place of words that the model does not know.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub asked_as: BTreeMap<String, String>,
@@ -70,25 +73,9 @@ pub struct Searched {
     /// measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub score_error_likely: Option<f32>,
-    /// Whether the whole region asked for was fetched; absent without `radius` and `box`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub area_fetched: Option<bool>,
-    /// Cells in the region asked for whose shards could not be fetched.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub bad_cells: Vec<BadCellAnswer>,
     /// How matches were clustered; only for `kind=clusters`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clustering: Option<Clustering>,
-}
-
-/// A cell whose shard could not be fetched.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
-pub struct BadCellAnswer {
-    /// The cell.
-    pub cell_id: u32,
-    /// The earlier generation that answers for it; absent: nothing of it is on board.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub generation: Option<u64>,
 }
 
 /// Answers to one text, or to several in their order: the schema of a reply, which is written piece by piece.

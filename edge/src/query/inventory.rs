@@ -14,6 +14,7 @@ use slag_common::objects::public_id;
 
 use super::answers::ClusterAnswer;
 use super::cluster::{Grouping, cluster};
+use super::coverage::coverage;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::names::Names;
 use super::objects::{self, FoundObject};
@@ -225,6 +226,7 @@ fn page(
         named: names.is_some(),
         n_objects: all.len(),
         next_after,
+        coverage: coverage(manifest, scene.bad_cells, scene.fetched, &filter.region),
         objects,
     })
 }

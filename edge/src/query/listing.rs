@@ -100,9 +100,9 @@ fn geojson(page: &ObjectPage) -> Value {
         }))
     };
     let features: Vec<Value> = page.objects.iter().filter_map(feature).collect();
-    let ObjectPage { scene, generation, next_after, .. } = page;
+    let ObjectPage { scene, generation, next_after, coverage, .. } = page;
     json!({
         "type": "FeatureCollection", "scene": scene, "generation": generation, "next_after": next_after,
-        "features": features,
+        "area_fetched": coverage.area_fetched, "bad_cells": coverage.bad_cells, "features": features,
     })
 }

@@ -9,6 +9,7 @@ mod arrow;
 mod ask;
 mod changes;
 pub mod cluster;
+mod coverage;
 mod engine;
 mod format;
 mod inventory;
@@ -31,12 +32,12 @@ mod view;
 
 pub use answer::answer;
 pub use answers::{
-    Answers, AnswersOrBatch, BadCellAnswer, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason,
-    ReasonKind, Searched,
+    Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason, ReasonKind, Searched,
 };
 pub use area::{Area, AreaBall, AreaBox, Corner, LatLon, Point};
 pub use ask::Ask;
 pub use changes::{ChangesError, ChangesRequest};
+pub(crate) use coverage::coverage;
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
 pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder};

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Serialize;
+use slag_api::coverage::Coverage;
 use slag_api::{FRAME, UNITS};
 
 use super::answers::{ClusterAnswer, Found, GaussianAnswer, Reason, ReasonKind, Searched};
@@ -46,6 +47,8 @@ struct Described<'a> {
     kind: AnswerKind,
     #[serde(flatten)]
     searched: Option<&'a Searched>,
+    #[serde(flatten)]
+    coverage: &'a Coverage,
     /// For phrases: the things that they name.
     #[serde(skip_serializing_if = "Option::is_none")]
     parts: Option<&'a [relations::Found]>,
@@ -172,6 +175,7 @@ impl<'a> Described<'a> {
             asked_as: outcome.asked_as(),
             kind: AnswerKind::Objects,
             searched: None,
+            coverage: outcome.coverage(),
             parts: None,
             none: None,
             next_offset: (outcome.len() > end).then_some(end),

@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use glam::DVec3;
+use slag_api::coverage::Coverage;
 use slag_common::shard::ShardView;
 
 use super::answers::{Reason, ReasonKind};
@@ -31,8 +32,9 @@ fn seen_share(shards: &[ShardView<'_>], region: &Region) -> Option<f64> {
     (n > 0).then(|| n_seen as f64 / n as f64)
 }
 
-/// Adds the seen share of the region to a reason; if too small for a no, kind and detail say so.
-pub fn add_seen(reason: &mut Reason, shards: &[ShardView<'_>], region: &Region) {
+/// Adds the seen share of the region to a reason; if too small for a no, kind and detail say so. The detail says what
+/// of the region is not on board.
+pub fn complete(reason: &mut Reason, shards: &[ShardView<'_>], region: &Region, coverage: &Coverage) {
     reason.seen_share = seen_share(shards, region);
     let seen = reason.seen_share.filter(|seen| *seen < MIN_SEEN);
     if let Some(share) = seen.filter(|_| reason.kind != ReasonKind::ClustersTooSmall) {
@@ -40,6 +42,9 @@ pub fn add_seen(reason: &mut Reason, shards: &[ShardView<'_>], region: &Region) 
         reason.detail =
             format!("not looked there: photos saw {percent:.0} % of what is on board{region}; {detail}");
         reason.kind = ReasonKind::NotLookedThere;
+    }
+    if let Some(missing) = coverage.missing() {
+        reason.detail = format!("{}; {missing}", reason.detail);
     }
 }
 
@@ -57,13 +62,14 @@ pub struct BestObject {
     pub position_in_world: DVec3,
 }
 
-/// Returns a hint for an empty region. `area_fetched`: whether all of the region was fetched; `None` if unknown.
-fn elsewhere(region: &Region, area_fetched: Option<bool>) -> &'static str {
-    match area_fetched {
-        Some(true) => "search elsewhere",
-        Some(false) => "fetch that area, or search elsewhere",
-        None if region.polygon.is_some() => "fetch that area if it is not on board, or search elsewhere",
-        None => "fetch another area",
+/// Returns a hint for an empty region; [`complete`] says what of it is known to be missing.
+fn elsewhere(region: &Region) -> &'static str {
+    match region {
+        Region { ball: None, bounds: None, polygon: None } => "fetch another area",
+        Region { ball: None, bounds: None, .. } => {
+            "fetch that area if it is not on board, or search elsewhere"
+        }
+        _ => "search elsewhere",
     }
 }
 
@@ -73,7 +79,6 @@ pub fn of_objects(
     request: &QueryRequest,
     threshold: f32,
     best: Option<BestObject>,
-    area_fetched: Option<bool>,
 ) -> Reason {
     let place = &request.region;
     let (kind, detail) = match &best {
@@ -88,29 +93,20 @@ pub fn of_objects(
             let detail = format!("there are Gaussians{place}, but none of an object{advice}");
             (ReasonKind::BelowThreshold, detail)
         }
-        None => (
-            ReasonKind::NothingThere,
-            format!("there is no object{place}; {}", elsewhere(place, area_fetched)),
-        ),
+        None => (ReasonKind::NothingThere, format!("there is no object{place}; {}", elsewhere(place))),
         Some(BestObject { reaches: false, score, position_in_world }) => (
             ReasonKind::BelowThreshold,
             format!(
                 "no object{place} reaches {threshold:.3}; the best has {score:.3}, at {position_in_world:.2}"
             ),
         ),
-        Some(BestObject { reaches: true, .. }) => {
-            let advice = match area_fetched {
-                Some(false) => "lower min_count, or fetch that area",
-                _ => "lower min_count",
-            };
-            (
-                ReasonKind::ClustersTooSmall,
-                format!(
-                    "no object that reaches {threshold:.3} has {} Gaussians{place}; {advice}",
-                    request.min_count
-                ),
-            )
-        }
+        Some(BestObject { reaches: true, .. }) => (
+            ReasonKind::ClustersTooSmall,
+            format!(
+                "no object that reaches {threshold:.3} has {} Gaussians{place}; lower min_count",
+                request.min_count
+            ),
+        ),
     };
     reason((kind, detail), best.map(|best| (best.score, best.position_in_world)))
 }
@@ -121,7 +117,6 @@ pub fn of_gaussians(
     request: &QueryRequest,
     threshold: f32,
     n_matching: u64,
-    area_fetched: Option<bool>,
 ) -> Reason {
     let place = &request.region;
     let best = search.best(1, f32::NEG_INFINITY, request.near).first().map(|hit| {
@@ -130,7 +125,7 @@ pub fn of_gaussians(
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
-            format!("there is no Gaussian with an embedding{place}; {}", elsewhere(place, area_fetched)),
+            format!("there is no Gaussian with an embedding{place}; {}", elsewhere(place)),
         ),
         Some(_) if n_matching > 0 => (
             ReasonKind::ClustersTooSmall,

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use slag_api::coverage::Coverage;
 use slag_common::manifest::Manifest;
 
 use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, Reason};
@@ -52,6 +53,7 @@ pub struct RelatedAnswers {
     /// Replacements of words that the model does not know.
     pub asked_as: BTreeMap<String, String>,
     pub parts: Vec<relations::Found>,
+    pub coverage: Coverage,
     pub miss: Option<Reason>,
     /// Best first, each with its degree and its witnesses.
     pub answers: Vec<(ClusterAnswer, f64, Vec<Witness>)>,
@@ -69,6 +71,13 @@ impl Outcome {
         match self {
             Self::Plain(answers) => answers.asked_as = asked_as,
             Self::Related(related) => related.asked_as = asked_as,
+        }
+    }
+
+    pub fn coverage(&self) -> &Coverage {
+        match self {
+            Self::Plain(answers) => &answers.coverage,
+            Self::Related(related) => &related.coverage,
         }
     }
 

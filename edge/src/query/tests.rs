@@ -85,7 +85,7 @@ fn clusters_are_ranked_nearest_best() {
     let answers = ask(&yard, |_, _| ());
     assert_eq!((answers.searched.n_searched, answers.searched.n_matching, answers.unit), (724, 224, "m"));
     assert_eq!(
-        (answers.reason.as_ref(), answers.searched.area_fetched, answers.searched.is_exact),
+        (answers.reason.as_ref(), answers.coverage.area_fetched, answers.searched.is_exact),
         (None, None, false)
     );
     let found = clusters(&answers);
@@ -181,13 +181,13 @@ fn empty_answers_say_why() {
     };
     let small = ask(&yard, ball(DVec3::new(0.0, 0.0, 9.0), 2.0));
     assert_eq!(small.reason.as_ref().expect("too small").kind, ReasonKind::ClustersTooSmall);
-    assert_eq!((small.searched.n_matching, small.searched.area_fetched), (4, Some(true)));
+    assert_eq!((small.searched.n_matching, small.coverage.area_fetched), (4, Some(true)));
     let nothing = ask(&yard, ball(DVec3::new(49.0, 49.0, 0.0), 2.0));
     let reason = nothing.reason.expect("nothing there");
     assert_eq!((reason.kind, reason.best_score), (ReasonKind::NothingThere, None));
-    assert_eq!(nothing.searched.area_fetched, Some(false));
+    assert_eq!(nothing.coverage.area_fetched, Some(false));
     let sticking_out = ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0));
-    assert_eq!(sticking_out.searched.area_fetched, Some(false));
+    assert_eq!(sticking_out.coverage.area_fetched, Some(false));
     let gaussians =
         ask(&yard, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(1.0)));
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
@@ -347,15 +347,15 @@ fn boxes_bound_what_is_searched() {
     let answers =
         ask(&yard, |request, _| request.region.bounds = bounds([-6.0, -1.0, -1.0], [-4.501, 1.0, 1.0]));
     // Points at -5, -4.99, ..: 50 of them lie below -4.501.
-    assert_eq!((answers.searched.n_matching, answers.searched.area_fetched), (50, Some(true)));
+    assert_eq!((answers.searched.n_matching, answers.coverage.area_fetched), (50, Some(true)));
     let far = ask(&yard, |request, _| request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 1.0]));
-    assert_eq!(far.searched.area_fetched, Some(false));
+    assert_eq!(far.coverage.area_fetched, Some(false));
     // The intersection of box and ball was fetched if either was.
     let both = ask(&yard, |request, _| {
         request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 1.0]);
         request.region.ball = Some(Ball { centre_in_world: DVec3::new(20.0, 0.0, 0.0), radius: 0.105 });
     });
-    assert_eq!((both.searched.area_fetched, both.searched.n_matching), (Some(true), 11));
+    assert_eq!((both.coverage.area_fetched, both.searched.n_matching), (Some(true), 11));
     let nothing = ask(&yard, |request, _| request.region.bounds = bounds([60.0; 3], [61.0; 3])).reason;
     assert!(nothing.expect("nothing there").detail.contains("in the box [60, 60, 60] to [61, 61, 61]"));
 }

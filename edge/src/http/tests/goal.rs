@@ -5,6 +5,7 @@ use slag_common::occupancy::{Block, BuiltOccupancy};
 use super::openapi::{check, description};
 use super::v1::{room_of, room_with};
 use super::*;
+use crate::store::{BadCell, CellFault};
 
 /// Occupancy of the room: a floor from -1 to 5 m along x and to 4 m along y, and the boxes of two mugs and a table.
 pub(super) fn places() -> BuiltOccupancy {
@@ -109,6 +110,38 @@ async fn groups_of_gaussians_are_gone_to() {
     let distance = (at(0) - at(0).clamp(0.0, 1.6)).hypot(at(1) - at(1).clamp(0.0, 0.9));
     assert!((0.3..0.9).contains(&distance), "{body:#}");
     assert!(goal["visible_share"].as_f64() > Some(0.1), "{body:#}");
+}
+
+/// What a cell that could not be fetched may hold is unknown: every answer says so, found or not.
+#[tokio::test]
+async fn what_is_not_on_board_is_not_denied() {
+    let service = Service::new(Some(&room_with(Some(&places()))), Settings::default());
+    let cache = service.app.engine.cache();
+    let mut current = cache.current().expect("reads").expect("there");
+    current.bad_cells = vec![BadCell { cell_id: 9, fault: CellFault::Missing, old: None }];
+    fs_err::write(cache.current_path(), serde_json::to_vec(&current).expect("JSON")).expect("writes");
+    service.app.reload_now();
+    let get = async |uri: &str| service.get(uri).await.2;
+    for (uri, detail) in [
+        ("/v1/query?text=largest+0&near=0,0,0&radius=3", None),
+        ("/v1/query?text=largest+2&near=0,0,0&radius=3", Some("1 cell in the region could not")),
+        ("/v1/query?text=2", Some("1 cell could not")),
+        ("/v1/objects?near=0,0,0&radius=3", None),
+        ("/v1/goal?text=nearest+2&near=2,3,0&step_m=0.15", Some("1 cell could not")),
+        ("/v1/goal?id=o00000000000000ff&near=2,3,0&step_m=0.15", Some("1 cell could not")),
+    ] {
+        let body = get(uri).await;
+        is_as_described(uri.split('?').next().unwrap_or_default(), &body);
+        let of = body["results"].get(0).unwrap_or(&body);
+        let said = of["none"]["detail"].as_str();
+        assert_eq!(said.is_some(), detail.is_some(), "{uri}: {body:#}");
+        assert!(said.zip(detail).is_none_or(|(said, part)| said.contains(part)), "{uri}: {body:#}");
+        if !uri.contains("goal") {
+            assert_eq!(of["bad_cells"][0]["cell_id"], 9, "{uri}: {body:#}");
+            let is_region = uri.contains("radius");
+            assert_eq!(of.get("area_fetched"), is_region.then_some(&json!(false)), "{uri}: {body:#}");
+        }
+    }
 }
 
 /// By hand: 6 by 5 m of seen floor in cells of 0.1 m, the table and the floor's mug in it.

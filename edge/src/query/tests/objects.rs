@@ -152,8 +152,8 @@ fn objects_abstain_and_keep_to_the_region() {
         (request.threshold, request.region.bounds) = (Some(0.5), Some(within(50.0, 60.0)));
     });
     let nothing = answers.reason.expect("no answer");
-    assert_eq!((nothing.kind, answers.searched.area_fetched), (ReasonKind::NothingThere, Some(false)));
-    assert!(nothing.detail.contains("fetch that area"), "{}", nothing.detail);
+    assert_eq!((nothing.kind, answers.coverage.area_fetched), (ReasonKind::NothingThere, Some(false)));
+    assert!(nothing.detail.contains("was not fetched"), "{}", nothing.detail);
     // With a negative the score is the difference of the object's scores: 0.8 - 0.9 for 21, 0 - 1 for 22.
     let question =
         Question { negatives: vec![std::sync::Arc::from([0.0f32, 1.0])], ..Question::new([1.0, 0.0]) };
@@ -183,7 +183,7 @@ fn reasons_are_of_the_region() {
                 request.threshold = Some(0.5);
             }
         });
-        let (is_on_board, reason) = (answers.searched.area_fetched, answers.reason.expect("no answer"));
+        let (is_on_board, reason) = (answers.coverage.area_fetched, answers.reason.expect("no answer"));
         assert_eq!(is_on_board, Some(true));
         assert!(!reason.detail.contains("fetch"), "{}", reason.detail);
         let is_inside = |at: DVec3| (from..=to).contains(&at.x);
