@@ -40,6 +40,10 @@ fn falling(value: f64, full: f64, none: f64) -> f64 {
 const TOUCHES_M: f64 = 0.1;
 /// Distance from which it surely does not touch.
 const APART_M: f64 = 0.25;
+/// As [`TOUCHES_M`] and [`APART_M`] at most, for what stands on legs: boxes lose thin ones.
+const LEGS_M: [f64; 2] = [0.3, 0.55];
+/// Length of such legs, as a share of the longest edge of the rest: a mug has none.
+const LEGS: [f64; 2] = [0.6, 1.0];
 /// Share of the support's height by which a thing's bottom may lie below its top: seats are lower than backs, and
 /// masks of a support may include what stands on it.
 const SUNK: f64 = 0.6;
@@ -61,13 +65,25 @@ fn resting(thing: &Solid, support: &Solid, metre: f64) -> f64 {
     let over = thing.shared_area(support) / thing.area().max(f64::MIN_POSITIVE);
     let gap = thing.bottom() - support.top();
     let sunk = -gap / (SUNK * support.height()).max(TOUCHES_M * metre);
-    let touches = falling(gap, TOUCHES_M * metre, APART_M * metre) * falling(sunk, 1.0, 1.5);
+    let mut apart = [TOUCHES_M * metre, APART_M * metre];
+    // On a floor or rug.
+    if support.half.z < PANEL * support.half.x.min(support.half.y) {
+        let longest = 2.0 * thing.half.max_element();
+        let legs = |at: usize| (LEGS[at] * longest).min(LEGS_M[at] * metre);
+        apart = [apart[0].max(legs(0)), apart[1].max(legs(1))];
+    }
+    let touches = falling(gap, apart[0], apart[1]) * falling(sunk, 1.0, 1.5);
     touches.min(falling(-over, -OVER[0], -OVER[1]))
+}
+
+fn is_panel(half: DVec2) -> bool {
+    half.min_element() < PANEL * half.max_element()
 }
 
 fn hanging(thing: &Solid, panel: &Solid, metre: f64) -> f64 {
     let (thick, wide) = (panel.half.x.min(panel.half.y), panel.half.x.max(panel.half.y));
-    let is_panel = thick < PANEL * wide && thing.volume() < panel.volume().max(wide * wide * thick);
+    let is_panel =
+        is_panel(panel.half.truncate()) && thing.volume() < panel.volume().max(wide * wide * thick);
     let is_off_the_ground = thing.bottom() > panel.bottom() + TOUCHES_M * metre;
     if !is_panel || !is_off_the_ground || thing.shared_height(panel) < 0.5 * thing.height() {
         return 0.0;
@@ -80,7 +96,10 @@ fn under(thing: &Solid, cover: &Solid, metre: f64) -> f64 {
         return 0.0;
     }
     let smaller = thing.area().min(cover.area()).max(f64::MIN_POSITIVE);
-    let share = thing.shared_area(cover) / smaller;
+    // A picture hangs above a bed that stands before the wall.
+    let hangs = is_panel(cover.half.truncate()) && cover.bottom() > thing.centre.z;
+    let reach = if hangs { APART_M * metre } else { 0.0 };
+    let share = thing.grown(reach).shared_area(cover) / smaller;
     // Under a table, not in the middle of a cupboard: it begins near the cover's bottom or below it.
     let raised = thing.bottom() - cover.bottom();
     let low = falling(raised, TOUCHES_M * metre, (APART_M * metre).max(0.3 * cover.height()));

@@ -40,6 +40,11 @@ fn a_room_by_hand() {
     // Its visible part begins above its feet.
     let wardrobe = solid([2.1, 0.0, 1.0], [1.0, 0.6, 1.88]);
     let lamp = solid([0.0, 0.0, 2.2], [0.4, 0.4, 0.3]);
+    // Without their legs, which are thin: the chair's box begins 0.35 m above the floor, the desk's 0.4 m.
+    let floor = solid([0.0, 0.0, -0.05], [6.0, 6.0, 0.1]);
+    let seat = solid([-2.0, 0.0, 0.65], [0.5, 0.5, 0.6]);
+    let desk = solid([2.0, -2.0, 0.57], [1.2, 0.6, 0.34]);
+    let bed = solid([0.5, 1.8, 0.3], [1.6, 2.0, 0.5]);
     // From the south, looking north.
     let viewer = Viewer { position_in_world: DVec3::new(0.0, -4.0, 0.0), heading_rad: Some(1.57) };
     let holds = |is, a: &Solid, b: &Solid| degree(is, a, b, Some(&viewer), METRES) >= HOLDS;
@@ -51,6 +56,10 @@ fn a_room_by_hand() {
         (Relation::On, &chair, &rug),
         (Relation::Under, &ball, &table),
         (Relation::Under, &table, &lamp),
+        (Relation::On, &seat, &floor),
+        (Relation::On, &desk, &floor),
+        (Relation::Above, &clock, &bed),
+        (Relation::Under, &bed, &clock),
         (Relation::Above, &lamp, &table),
         (Relation::In, &plate, &cupboard),
         (Relation::Near, &mug, &table),
@@ -67,6 +76,10 @@ fn a_room_by_hand() {
         (Relation::On, &table, &mug),
         (Relation::On, &ball, &table),
         (Relation::On, &lamp, &table),
+        (Relation::On, &mug, &floor),
+        (Relation::On, &cushion, &rug),
+        (Relation::On, &lamp, &floor),
+        (Relation::Under, &chair, &wall),
         (Relation::On, &chair, &table),
         (Relation::On, &cupboard, &wall),
         (Relation::Under, &mug, &table),
