@@ -386,7 +386,8 @@ pub fn query(data: &[u8]) -> bool {
 pub fn grammar(data: &[u8]) -> bool {
     let text = String::from_utf8_lossy(data).into_owned();
     let read = std::thread::Builder::new().stack_size(2 << 20).spawn(move || {
-        let phrases = [relations::understand(&text), serde_json::from_str::<Phrase>(&text).ok()];
+        let phrases =
+            [relations::understand(&text).ok().flatten(), serde_json::from_str::<Phrase>(&text).ok()];
         let phrases = phrases.into_iter().flatten().filter(|phrase| phrase.check().is_ok());
         phrases.inspect(|phrase| assert!(phrase.things().len() <= relations::MAX_THINGS)).count() > 0
     });

@@ -54,4 +54,4 @@ pub use provider::{NoProvider, Provider};
 pub use session::{SessionOptions, find_runtime};
 pub use synonyms::KnownPhrases;
 pub use text_side::{TextSide, TextSideError};
-pub use words::{everyday_nouns, everyday_texts, words_to_find};
+pub use words::{everyday_nouns, everyday_texts, words, words_to_find};

@@ -3,32 +3,44 @@
 use crate::InferenceError;
 
 /// Words that name nothing to find: alone, a text model would answer them with the nearest object.
-const NAMELESS: &str = "a an and are at behind beneath between biggest bring by closest farthest fifth find first for fourth \
-    from furthest go here i in is it largest littlest look me my near nearest next no not of on one or over second show \
-    smallest some take that the there these third this to under us what where where's which with your you";
+const NAMELESS: &str = "a all an and any are at behind beneath between biggest bring by closest farthest fifth find first for fourth \
+    from furthest go here i in is it largest littlest look me my near nearest next no not of on one or over please second show \
+    smallest some take that the there these third this to under us what what's where where's which with your you";
 
-/// Returns the words of a text, separated by a space, without signs around them (emoji, quotation and question marks,
-/// invisible characters). Refuses a text without a word that can name something.
-pub fn words_to_find(text: &str) -> Result<String, InferenceError> {
+/// Returns the words of a text: letters, digits and apostrophes, with hyphens between them and points between digits.
+pub fn words(text: &str) -> Vec<String> {
     let is_invisible = |c: &char| matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{2069}' | '\u{fe00}'..='\u{fe0f}' | '\u{feff}');
-    let visible: String = text.chars().filter(|c| !is_invisible(c)).collect();
-    // A sign within a word, as in "t-shirt", belongs to it; emoji separate words.
-    let is_between = |c: char| c.is_whitespace() || !(c.is_ascii() || c.is_alphanumeric() || is_mark(c));
-    let words = visible
-        .split(is_between)
-        .map(|word| word.trim_matches(|c: char| !(c.is_alphanumeric() || is_mark(c))));
-    let words: Vec<&str> = words.filter(|word| !word.is_empty()).collect();
+    let plain = |c: char| match c {
+        '\u{2018}' | '\u{2019}' | '\u{2bc}' => '\'',
+        '\u{2010}' | '\u{2011}' => '-',
+        other => other,
+    };
+    let signs: Vec<char> = text.chars().filter(|c| !is_invisible(c)).map(plain).collect();
+    // Combining marks are part of a letter.
+    let is_letter = |c: char| c.is_alphanumeric() || matches!(c, '\u{300}'..='\u{36f}');
+    let around = |at: usize, is: fn(char) -> bool| {
+        at > 0 && is(signs[at - 1]) && signs.get(at + 1).is_some_and(|after| is(*after))
+    };
+    let of_word = |(at, c): (usize, &char)| match c {
+        '-' if around(at, char::is_alphanumeric) => '-',
+        '.' if around(at, |c| c.is_ascii_digit()) => '.',
+        c if is_letter(*c) || *c == '\'' => *c,
+        _ => ' ',
+    };
+    let words: String = signs.iter().enumerate().map(of_word).collect();
+    let words = words.split(' ').map(|word| word.trim_matches('\''));
+    words.filter(|word| !word.is_empty()).map(str::to_owned).collect()
+}
+
+/// Returns the words of a text, separated by a space. Refuses a text without a word that can name something.
+pub fn words_to_find(text: &str) -> Result<String, InferenceError> {
+    let words = words(text);
     let is_nameless =
-        |word: &&str| NAMELESS.split_whitespace().any(|nameless| word.eq_ignore_ascii_case(nameless));
+        |word: &String| NAMELESS.split_whitespace().any(|nameless| word.eq_ignore_ascii_case(nameless));
     match words.iter().all(is_nameless) {
         true => Err(InferenceError::EmptyText),
         false => Ok(words.join(" ")),
     }
-}
-
-/// Combining marks and typographic apostrophes are part of a word.
-fn is_mark(c: char) -> bool {
-    matches!(c, '\u{300}'..='\u{36f}' | '\u{2019}')
 }
 
 /// Phrases as people ask them, one per line.
@@ -56,8 +68,12 @@ mod tests {
         {
             assert_eq!(words_to_find(text).expect(text), "chair");
         }
-        assert_eq!(words_to_find("a man’s T-shirt, size 3.5").expect("named"), "a man’s T-shirt size 3.5");
+        assert_eq!(words_to_find("a man’s T-shirt, size 3.5").expect("named"), "a man's T-shirt size 3.5");
         assert_eq!(words_to_find("so\u{ad}fa🪑ch\u{200b}air").expect("named"), "sofa chair");
+        assert_eq!(
+            words("bottle… (on-the) ‘table’/coffee_mug -"),
+            ["bottle", "on-the", "table", "coffee", "mug"]
+        );
         assert_eq!(words_to_find("чашка на столе").expect("named"), "чашка на столе");
     }
 

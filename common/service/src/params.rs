@@ -115,7 +115,17 @@ impl<T: DeserializeOwned> Params<T> {
     /// Parses decoded `name=value` pairs.
     pub fn read(pairs: &[(String, String)]) -> Result<T, RequestError> {
         let mut reader = Pairs { pairs, known: Vec::new() };
-        let read = T::deserialize(&mut reader)?;
+        // "Text" in place of "text": the name is wrong, not the value missing.
+        let misspelt = |error: RequestError| {
+            let is_like = |(name, _): &&(String, String)| {
+                *name != error.parameter && name.eq_ignore_ascii_case(&error.parameter)
+            };
+            match pairs.iter().find(is_like) {
+                Some((name, value)) => RequestError::new(&shown(name), value, error.parameter),
+                None => error,
+            }
+        };
+        let read = T::deserialize(&mut reader).map_err(misspelt)?;
         match pairs.iter().find(|(name, _)| !reader.known.contains(&name.as_str())) {
             None => Ok(read),
             Some((name, value)) => {

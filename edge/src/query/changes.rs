@@ -84,6 +84,7 @@ impl Engine {
         let generations = known(self.cache(), manifest);
         let to = generation(self.cache(), snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
         let from = match request.from {
+            _ if generations.iter().all(|of| *of >= to.generation) => None,
             Some(from) if from >= to.generation => {
                 let expected = format!("less than {}, the generation to compare with", to.generation);
                 let error = RequestError::new("from", &from.to_string(), expected);

@@ -256,23 +256,17 @@ impl QueryRequest {
     /// Parses texts with relations, if answers are objects and the generation has them.
     ///
     /// # Errors
-    /// A text names more things than a phrase may have: without its relations it would ask for something else.
+    /// A text that breaks a phrase's limit: without its relations it would ask for something else.
     pub(super) fn understand(&mut self, snapshot: &Snapshot) -> Result<(), RequestError> {
         if !matches!(self.kind, None | Some(AnswerKind::Objects)) || snapshot.objects.is_empty() {
             return Ok(());
         }
         for asked in &mut self.asked {
             let Asked::Text(text) = asked else { continue };
-            match relations::understand(text) {
-                // The text is too long: nobody gave a phrase.
-                Some(phrase) if phrase.n_things() > relations::MAX_THINGS => {
-                    phrase.check().map_err(|error| RequestError { parameter: "text".to_owned(), ..error })?;
-                }
-                // A phrase that breaks another limit stays one text for the text model.
-                Some(phrase) if phrase.check().is_ok() => {
-                    *asked = Asked::Phrase { text: Some(std::mem::take(text)), phrase };
-                }
-                _ => {}
+            if let Some(phrase) = relations::understand(text)? {
+                // Nobody gave a phrase.
+                phrase.check().map_err(|error| RequestError { parameter: "text".to_owned(), ..error })?;
+                *asked = Asked::Phrase { text: Some(std::mem::take(text)), phrase };
             }
         }
         Ok(())
@@ -332,7 +326,8 @@ impl QueryRequest {
         negatives.iter().try_for_each(|text| check_text("negatives", text))?;
         // A text equal to its negative scores the same everywhere.
         let mut texts = self.asked.iter().filter(|of| !matches!(of, Asked::Vector { .. })).map(Asked::label);
-        match texts.find(|text| negatives.iter().any(|of| of.trim() == text.trim())) {
+        let negatives: Vec<String> = negatives.iter().map(|text| relations::normal(text)).collect();
+        match texts.find(|text| negatives.contains(&relations::normal(text))) {
             Some(text) => Err(RequestError::new("negatives", text, "words other than those asked for")),
             None => Ok(()),
         }

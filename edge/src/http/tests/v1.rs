@@ -270,6 +270,9 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({"texts": ["0"], "region": {"box": {"from": [0, 0, 1], "to": [5, 5, 1]}}}), "box"),
         (json!({"texts": ["0"], "region": {"ball": {"centre": [0, 0, 0], "radius": -1}}}), "radius"),
         (json!({"texts": ["0"], "negatives": ["0"]}), "negatives"),
+        (json!({"texts": ["0 x"], "negatives": ["the 0 X"]}), "negatives"),
+        (json!({"texts": ["101st nearest 0"], "near": [0, 0, 0]}), "texts"),
+        (json!({"texts": ["0 not on 1"]}), "texts"),
         (json!({"texts": [format!("0{}", " on 0".repeat(8))]}), "texts"),
         (json!({"texts": [" "]}), "texts"),
         (json!({"vectors": vec![[1.0, 0.0, 0.0]; 33]}), "vectors"),
@@ -293,6 +296,7 @@ async fn wrong_requests_are_refused_by_name() {
         ("text=0&min_score=2", "min_score"),
         ("text=0&negative=%3F", "negative"),
         ("text=0&texts=1", "texts"),
+        ("Text=0", "Text"),
         (&format!("text=0{}", "+on+0".repeat(8)), "text"),
         (&"text=0&".repeat(33), "text"),
     ] {

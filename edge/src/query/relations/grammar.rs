@@ -3,6 +3,7 @@
 //! ```text
 //! phrase   = [pick] thing [place]
 //! pick     = [nth] ("largest" | "smallest" | "nearest" | "farthest")   -- or nth alone, with "from"
+//!            the last two also after the thing: "chair nearest to the sink" is "nearest chair to the sink"
 //! place    = relation phrase | "between" phrase "and" phrase | ("from" | "to") phrase
 //! ```
 //!
@@ -10,7 +11,10 @@
 //! near the window" is a mug on (a table near the window). Texts over [`MAX_TEXT_BYTES`] are no phrases, which bounds
 //! time and recursion.
 
-use super::phrase::{By, Phrase, Pick, Place, Relation};
+use slag_models::words;
+use slag_service::params::RequestError;
+
+use super::phrase::{ASKER, By, MAX_NTH, Phrase, Pick, Place, Relation};
 use crate::text::MAX_TEXT_BYTES;
 
 /// The words of each relation; the longest match counts.
@@ -57,11 +61,14 @@ const PICKS: [(&str, By); 8] = [
     ("farthest", By::Farthest),
     ("furthest", By::Farthest),
 ];
-const NTH: [&str; 10] =
-    ["first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"];
+const NTH: [&str; 12] = [
+    "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth",
+    "eleventh", "twelfth",
+];
 const ARTICLES: [&str; 4] = ["the", "a", "an", "my"];
-/// Words before the thing asked for.
-const OPENINGS: [&str; 10] = [
+/// Words before the thing asked for, one after another.
+const OPENINGS: [&str; 16] = [
+    "please",
     "where is",
     "where are",
     "where's",
@@ -72,24 +79,90 @@ const OPENINGS: [&str; 10] = [
     "bring me",
     "look for",
     "take me to",
+    "is there",
+    "are there",
+    "any",
+    "all of",
+    "all",
+];
+/// Words before a relation that ask for any thing.
+const ANY: [&str; 3] = ["what is", "what's", "what are"];
+const NEGATIONS: [&str; 4] = ["not", "isn't", "aren't", "never"];
+/// Words that make "within" a distance.
+const UNITS: [&str; 13] = [
+    "m",
+    "metre",
+    "metres",
+    "meter",
+    "meters",
+    "cm",
+    "centimetres",
+    "centimeters",
+    "foot",
+    "feet",
+    "ft",
+    "inches",
+    "yards",
 ];
 
 /// Parses a text as a phrase; `None` if it names no relation and no pick, or is too long: it is then one thing, for
 /// the text model. [`Phrase::check`] checks the limits.
-pub fn understand(text: &str) -> Option<Phrase> {
+///
+/// # Errors
+/// A word that would turn the meaning of a relation is not understood: without it, another thing would be found.
+pub fn understand(text: &str) -> Result<Option<Phrase>, RequestError> {
     if text.len() > MAX_TEXT_BYTES {
-        return None;
+        return Ok(None);
     }
-    let lower = text.to_lowercase();
-    let words = words(&lower);
-    let phrase = phrase(&words[opening(&words)..])?;
-    (!phrase.is_asker() && (phrase.pick.is_some() || phrase.relation.is_some())).then_some(phrase)
+    let words = words_of(text);
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let words = &words[opening(&words)..];
+    let any =
+        ANY.iter().filter_map(|pattern| starts(words, pattern)).find(|n| relation(&words[*n..]).is_some());
+    let words = any.map_or(words.to_vec(), |n| [&["thing"], &words[n..]].concat());
+    refuse(&words)?;
+    let found = phrase(&words);
+    Ok(found.filter(|of| !of.is_asker() && (of.pick.is_some() || of.relation.is_some())))
+}
+
+/// Refuses words that are not understood beside relations and comparisons.
+fn refuse(words: &[&str]) -> Result<(), RequestError> {
+    let refused = |found: String, expected: String| Err(RequestError::new("text", &found, expected));
+    for at in 1..words.len() {
+        let (here, after) = (words[at], &words[at + 1..]);
+        if !after.is_empty() && (here == "without" || NEGATIONS.contains(&here) && relation(after).is_some())
+        {
+            let named = thing(&words[..at]).map_or_else(|| "the thing".to_owned(), |of| of.thing);
+            let advice = format!("no {here:?}, which relations do not understand; ask for {named:?} alone");
+            return refused(words.join(" "), advice);
+        }
+        if here == "within" && after.iter().take(3).any(|word| UNITS.contains(word)) {
+            let advice =
+                "near in place of a distance, or the distance as radius around a position given as near";
+            return refused(words[at..].join(" "), advice.to_owned());
+        }
+    }
+    let is_nth = |word: &str| ["st", "nd", "rd", "th"].iter().any(|end| word.ends_with(end));
+    match without_article(words) {
+        [first, by, after @ ..]
+            if is_nth(first)
+                && nth(&[first]).0.is_none()
+                && picked(by).is_some()
+                && origin(after).is_none() =>
+        {
+            refused(
+                (*first).to_owned(),
+                format!("a number from 1st to {MAX_NTH}th, or in words up to twelfth"),
+            )
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Returns the thing asked for ("sofa" for "Where is the sofa?"); `None` without words before a thing.
 pub fn asked_thing(text: &str) -> Option<String> {
-    let lower = text.to_lowercase();
-    let words = words(&lower);
+    let words = words_of(text);
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
     let thing = match opening(&words) {
         0 => return None,
         opening => without_article(&words[opening..]),
@@ -97,14 +170,46 @@ pub fn asked_thing(text: &str) -> Option<String> {
     (!thing.is_empty()).then(|| thing.join(" "))
 }
 
-/// Returns the words of a text without surrounding punctuation.
-fn words(lower: &str) -> Vec<&str> {
-    let words = lower.split_whitespace().map(|word| word.trim_matches(['.', ',', '?', '!', '"']));
-    words.filter(|word| !word.is_empty()).collect()
+/// Returns a text's words in lower case without what stands before the thing: texts that ask the same are equal.
+pub fn normal(text: &str) -> String {
+    let words = words_of(text);
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    without_article(&words[opening(&words)..]).join(" ")
 }
 
+/// Returns the words of a text in lower case, and those of "on-the", which name no thing, apart.
+fn words_of(text: &str) -> Vec<String> {
+    let is_bare = |part: &str| {
+        ARTICLES.contains(&part)
+            || RELATIONS.iter().any(|(words, _)| words.split(' ').any(|word| word == part))
+    };
+    let apart = |word: String| match word.split('-').all(is_bare) {
+        true => word.split('-').map(str::to_owned).collect(),
+        false => vec![word],
+    };
+    words(&text.to_lowercase()).into_iter().flat_map(apart).collect()
+}
+
+/// Returns the number of words before the thing asked for.
 fn opening(words: &[&str]) -> usize {
-    OPENINGS.iter().filter_map(|opening| starts(words, opening)).max().unwrap_or(0)
+    let mut n = 0;
+    while let Some(more) = OPENINGS.iter().filter_map(|opening| starts(&words[n..], opening)).max() {
+        n += more;
+    }
+    n
+}
+
+fn picked(word: &str) -> Option<By> {
+    PICKS.iter().find(|(name, _)| *name == word).map(|(_, by)| *by)
+}
+
+/// Returns the words after "to" or "from", or those that begin with an article or are the asker.
+fn origin<'a, 'b>(words: &'a [&'b str]) -> Option<&'a [&'b str]> {
+    let (first, rest) = words.split_first()?;
+    match *first {
+        "to" | "from" => Some(rest),
+        word => (ARTICLES.contains(&word) || ASKER.contains(&word)).then_some(words),
+    }
 }
 
 /// Returns the number of words of `pattern` if `words` begin with it.
@@ -128,26 +233,33 @@ fn without_article<'a, 'b>(words: &'a [&'b str]) -> &'a [&'b str] {
 fn phrase(words: &[&str]) -> Option<Phrase> {
     let words = without_article(words);
     let (nth, rest) = nth(words);
-    let by = rest.first().and_then(|word| PICKS.iter().find(|(name, _)| name == word)).map(|(_, by)| *by);
+    let by = rest.first().and_then(|word| picked(word));
     let head = if by.is_some() { &rest[1..] } else { rest };
     let is_from = |at: usize| match by {
         Some(by) => by.is_distance() && matches!(head[at], "from" | "to"),
         None => nth.is_some() && head[at] == "from",
     };
+    // "Nearest to the sink" after the thing; "nearest" before another word may be of a name.
+    let picks = |at: usize| {
+        let by = picked(head[at]).filter(|of| by.is_none() && of.is_distance())?;
+        Some((by, origin(&head[at + 1..])?))
+    };
     // The thing itself takes at least one word, as does the part after the relation.
-    let at = (1..head.len().saturating_sub(1)).find(|at| is_from(*at) || relation(&head[*at..]).is_some());
-    let pick = |from: Option<Phrase>| -> Option<Pick> {
+    let mut places = 1..head.len().saturating_sub(1);
+    let at = places.find(|at| is_from(*at) || picks(*at).is_some() || relation(&head[*at..]).is_some());
+    let pick = |by: Option<By>, from: Option<Phrase>| -> Option<Pick> {
         let by = by.or(from.is_some().then_some(By::Nearest))?;
         Some(Pick { by, n: nth.unwrap_or(1), from: from.map(Box::new) })
     };
     let Some(at) = at else {
         // "First aid box": a number with nothing to count from is part of the name.
         let named = if by.is_some() { head } else { words };
-        return Some(Phrase { pick: pick(None), ..thing(named)? });
+        return Some(Phrase { pick: pick(by, None), ..thing(named)? });
     };
-    if is_from(at) {
-        let from = phrase(&head[at + 1..])?;
-        return Some(Phrase { pick: pick(Some(from)), ..thing(&head[..at])? });
+    let from =
+        if is_from(at) { Some((by, &head[at + 1..])) } else { picks(at).map(|(by, of)| (Some(by), of)) };
+    if let Some((by, from)) = from {
+        return Some(Phrase { pick: pick(by, Some(phrase(from)?)), ..thing(&head[..at])? });
     }
     let (is, n) = relation(&head[at..])?;
     let after = &head[at + n..];
@@ -158,11 +270,15 @@ fn phrase(words: &[&str]) -> Option<Phrase> {
     } else {
         Place { is, of: phrase(after)?, and: None }
     };
-    Some(Phrase { pick: pick(None), relation: Some(Box::new(place)), ..thing(named)? })
+    Some(Phrase { pick: pick(by, None), relation: Some(Box::new(place)), ..thing(named)? })
 }
 
 fn thing(words: &[&str]) -> Option<Phrase> {
-    let words = without_article(words);
+    let mut words = without_article(words);
+    // "Chair that is on the rug".
+    while let [named @ .., "that" | "which" | "is" | "are"] = words {
+        words = named;
+    }
     (!words.is_empty()).then(|| Phrase::thing(words.join(" ")))
 }
 
@@ -172,7 +288,7 @@ fn nth<'a, 'b>(words: &'a [&'b str]) -> (Option<usize>, &'a [&'b str]) {
     let spelt = NTH.iter().position(|name| name == first).map(|at| at + 1);
     let digits = || {
         let number = ["st", "nd", "rd", "th"].iter().find_map(|end| first.strip_suffix(end))?;
-        number.parse().ok().filter(|n| *n > 0)
+        number.parse().ok()
     };
     match spelt.or_else(digits) {
         Some(n) => (Some(n), rest),
@@ -187,7 +303,7 @@ mod tests {
     use super::*;
 
     fn read(text: &str) -> Value {
-        serde_json::to_value(understand(text)).expect("JSON")
+        serde_json::to_value(understand(text).expect(text)).expect("JSON")
     }
 
     #[test]
@@ -223,6 +339,60 @@ mod tests {
     }
 
     #[test]
+    fn people_ask_in_many_words_and_signs() {
+        let same = |one: &str, other: &str| assert_eq!(read(one), read(other), "{one}");
+        let is_phrase = |text: &str| assert!(read(text).is_object(), "{text}");
+        for text in
+            ["chair closest to the sink", "chair that is nearest to the sink", "chair nearest the sink"]
+        {
+            same(text, "nearest chair to the sink");
+        }
+        same("second thing farthest from the door", "second farthest thing from the door");
+        same("mug nearest me", "nearest mug to me");
+        for text in [
+            "bottle (on the table)",
+            "Where\u{2019}s the bottle on the table?",
+            "\u{201c}bottle\u{201d}\u{2026}on the table",
+            "bottle on-the table",
+            "please find the bottle on the table",
+            "is there a bottle on the table",
+            "Please show me any bottle on the table!",
+            "bottle which is on the table",
+        ] {
+            same(text, "bottle on the table");
+            is_phrase(text);
+        }
+        same("are there any bottles on the table", "bottles on the table");
+        same("all of the bottles on the table", "bottles on the table");
+        same("what is on the table", "thing on the table");
+        same("What\u{2019}s on the table?", "thing on the table");
+        is_phrase("twelfth largest thing");
+        assert_eq!(read("t-shirt"), Value::Null);
+    }
+
+    /// Words that are not understood are refused by name, rather than left out or taken for a thing.
+    #[test]
+    fn what_would_be_misunderstood_is_refused() {
+        for (text, named) in [
+            ("chair not near the table", "\"not\""),
+            ("chair without arms", "\"without\""),
+            ("chair within 3 m of the door", "radius"),
+            ("twenty-first nearest chair", "100th"),
+        ] {
+            let error = understand(text).expect_err(text).to_string();
+            assert!(error.contains(named), "{error}");
+        }
+        for text in ["101st nearest chair", "0th nearest chair"] {
+            let phrase = understand(text).expect(text).expect("a phrase");
+            assert!(phrase.check().is_err(), "{text}");
+        }
+        for text in ["do not enter sign", "first aid box"] {
+            assert_eq!(understand(text), Ok(None), "{text}");
+        }
+        assert!(read("chest nearest the door").is_object());
+    }
+
+    #[test]
     fn what_is_no_relation_stays_a_plain_phrase() {
         for text in [
             "chair",
@@ -240,7 +410,7 @@ mod tests {
             "largest",
             "mug on the",
         ] {
-            let found = understand(text);
+            let found = understand(text).expect(text);
             assert!(found.is_none(), "{text}: {found:?}");
         }
     }
@@ -249,7 +419,9 @@ mod tests {
     #[test]
     fn long_texts_are_no_phrases() {
         let read = |text: String| {
-            let read = std::thread::Builder::new().stack_size(2 << 20).spawn(move || understand(&text));
+            let read = std::thread::Builder::new()
+                .stack_size(2 << 20)
+                .spawn(move || understand(&text).expect("understood"));
             read.expect("a thread").join().expect("no overflow")
         };
         // No article, which would be nothing.
@@ -272,7 +444,8 @@ mod tests {
     /// Phrases survive JSON and back; errors in JSON are named.
     #[test]
     fn phrases_are_checked() {
-        let phrase = understand("third nearest mug to the lamp on the desk").expect("a phrase");
+        let phrase =
+            understand("third nearest mug to the lamp on the desk").expect("understood").expect("a phrase");
         let text = serde_json::to_string(&phrase).expect("JSON");
         assert_eq!(serde_json::from_str::<Phrase>(&text).expect("a phrase"), phrase);
         assert_eq!(phrase.check(), Ok(()));

@@ -9,6 +9,6 @@ mod rank;
 
 pub use candidates::{CandidateOf, ClustersOfThing, Found, Things, metre};
 pub use geometry::{HOLDS, Viewer};
-pub use grammar::{asked_thing, understand};
+pub use grammar::{asked_thing, normal, understand};
 pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation};
 pub use rank::{Related, Witness, relate};
