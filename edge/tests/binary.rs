@@ -260,7 +260,17 @@ fn a_robot_is_followed_along_stdin() {
     assert_eq!((code, &reports[0]["error"]["kind"]), (Some(1), &"fetch".into()), "{log}");
     assert!(reports[0]["error"]["detail"].as_str().is_some_and(|text| text.contains("geo-reference")));
     assert_eq!(run(dir.path(), &["query", "red", "--json"]).0, Some(0));
-    assert_eq!(watch("").0, Some(0));
+    for nothing in ["", "nonsense\n"] {
+        let (code, reports, log) = watch(nothing);
+        assert_eq!((code, &reports[0]["error"]["kind"]), (Some(1), &"positions".into()), "{log}");
+    }
+    let (code, out, _) = run(dir.path(), &["fetch", "--scene", "other", "--json"]);
+    assert!(code == Some(1) && out.contains(r#"fetch --scene \"paint\""#), "{out}");
+    let root = dir.path().join("a.root.json");
+    fs_err::write(&root, "{}").expect("written");
+    let root = root.to_str().expect("UTF-8");
+    let (code, out, _) = run(dir.path(), &["trust", "add", "--root", root, "--json"]);
+    assert!(code == Some(1) && out.contains(root), "{out}");
 }
 
 #[test]

@@ -489,8 +489,10 @@ fn checked(arg: &Arg, values: Vec<String>, place: &str) -> Result<Vec<String>, C
     let long = arg.get_long().unwrap_or_default().to_owned();
     let refused = |e: clap::Error| {
         let text = e.to_string();
-        let line = text.lines().next().unwrap_or_default();
-        wrong(place, line.strip_prefix("error: ").unwrap_or(line))
+        // What was found, and the values that are taken.
+        let lines: Vec<&str> = text.lines().take_while(|line| !line.is_empty()).map(str::trim).collect();
+        let what = lines.join(" ");
+        wrong(place, what.strip_prefix("error: ").unwrap_or(&what))
     };
     let parser = match arg.get_action() {
         ArgAction::SetTrue => clap::value_parser!(bool),

@@ -112,9 +112,13 @@ fn or_here(dir: &Path) -> &Path {
 }
 
 fn trust(cache: &EdgeCache) -> Finding {
-    let Some(accepted) = accepted(cache) else {
-        let advice = "no store; the cloud's `slag-encoder serve` prints the line: slag-edge trust add URL --sha256 HEX";
-        return Finding::new("trust", Verdict::Missing, advice);
+    let accepted = match accepted(cache) {
+        Ok(Some(accepted)) => accepted,
+        Ok(None) => {
+            let advice = "no store; the cloud's `slag-encoder serve` prints the line: slag-edge trust add URL --sha256 HEX";
+            return Finding::new("trust", Verdict::Missing, advice);
+        }
+        Err(error) => return Finding::new("trust", Verdict::Missing, error_line(&error)),
     };
     let root = format!("root {} {}", accepted.root_version, accepted.root_sha256);
     match accepted.expires_unix_secs {
@@ -154,7 +158,7 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
     let place = format!("{} {unit} around {:.2}", status.radius, status.centre_in_world);
     let mut findings =
         vec![Finding::new("scene", Verdict::Ok, scene), Finding::new("place", Verdict::Ok, place)];
-    if let Some(signed) = accepted(cache).and_then(|accepted| accepted.signed_unix_secs) {
+    if let Some(signed) = accepted(cache).ok().flatten().and_then(|accepted| accepted.signed_unix_secs) {
         findings.push(age(signed, crate::now_unix_secs()));
     }
     let mut note = |what, text: &str| findings.push(Finding::new(what, Verdict::Note, text));

@@ -61,14 +61,13 @@ impl Failure {
             Self::Interrupted(error) => (Exit::Interrupted, "interrupted", error),
         };
         let detail = crate::error_line(&*error);
-        let _ = match json {
-            true => writeln!(
-                io::stdout(),
-                "{}",
-                serde_json::json!({ "error": { "kind": kind, "detail": detail } })
-            ),
-            false => writeln!(io::stderr(), "error: {}", visible(&detail)),
+        let is_told = json && {
+            let error = serde_json::json!({ "error": { "kind": kind, "detail": detail } });
+            writeln!(io::stdout(), "{error}").is_ok()
         };
+        if !is_told {
+            let _ = writeln!(io::stderr(), "error: {}", visible(&detail));
+        }
         exit
     }
 }
@@ -77,6 +76,10 @@ impl From<io::Error> for Failure {
     fn from(error: io::Error) -> Self {
         match error.kind() {
             io::ErrorKind::BrokenPipe => Self::BrokenPipe,
+            // Errors of files and connections name them: this one is of stdout.
+            _ if error.raw_os_error().is_some() => {
+                Self::Failed("io", anyhow::anyhow!("the output could not be written: {error}"))
+            }
             _ => Self::Failed("io", error.into()),
         }
     }
@@ -115,6 +118,8 @@ mod tests {
         assert_eq!(Failure::Failed("io", error()).report(false), Exit::Failed);
         assert_eq!(Failure::Partial(error()).report(true), Exit::Partial);
         assert_eq!(Failure::Interrupted(error()).report(false), Exit::Interrupted);
+        let full = Failure::from(io::Error::from_raw_os_error(28));
+        assert!(full.text().starts_with("the output could not be written: "), "{}", full.text());
         assert_eq!(Failure::from(io::Error::from(io::ErrorKind::BrokenPipe)).report(false), Exit::Done);
         assert_eq!(
             [Exit::Done, Exit::Failed, Exit::Usage, Exit::Partial, Exit::Interrupted].map(|exit| exit as u8),

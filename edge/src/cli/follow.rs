@@ -10,6 +10,7 @@ use crate::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow,
 use crate::fetch::{FetchRequest, fetch, last_position};
 use crate::http::{App, RESTARTS, keep_following};
 use crate::store::EdgeCache;
+use anyhow::anyhow;
 use clap::Args;
 
 use super::args::parse_reach;
@@ -61,16 +62,19 @@ pub fn watch(
     }
     let posting = Arc::clone(&following);
     // Not joined: it may wait for a line that never comes.
-    std::thread::Builder::new().name("positions".into()).spawn(move || {
-        let read = read_positions(io::stdin().lock(), |line, position| match position {
-            Ok(position) => posting.post(position),
-            Err(error) => tracing::warn!("line {line}: {error}"),
-        });
-        if let Err(error) = read {
-            tracing::warn!("positions can no longer be read: {error}");
-        }
-        posting.close();
-    })?;
+    std::thread::Builder::new()
+        .name("positions".into())
+        .spawn(move || {
+            let read = read_positions(io::stdin().lock(), |line, position| match position {
+                Ok(position) => posting.post(position),
+                Err(error) => tracing::warn!("line {line}: {error}"),
+            });
+            if let Err(error) = read {
+                tracing::warn!("positions can no longer be read: {error}");
+            }
+            posting.close();
+        })
+        .map_err(|e| Failure::Failed("threads", e.into()))?;
     let mut printed = Ok(());
     let followed = follow(
         cache,
@@ -99,7 +103,15 @@ pub fn watch(
         },
     );
     printed?;
-    followed.map_err(failure)
+    followed.map_err(failure)?;
+    match following.status().position {
+        Some(_) => Ok(()),
+        None => {
+            let expected =
+                "standard input had no position; expected lines `x y z`, `lat,lon[,height]` or JSON";
+            Err(Failure::Failed("positions", anyhow!(expected)))
+        }
+    }
 }
 
 /// Follows the positions posted to the service, on a separate thread, until the returned flag is set. The service

@@ -23,7 +23,7 @@ pub struct StatusArgs {
 pub fn run(args: StatusArgs) -> Result<(), Failure> {
     let cache = args.cache.open()?;
     let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
-    let accepted = accepted(&cache);
+    let accepted = accepted(&cache).ok().flatten();
     let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
     let is_expired = expires_unix_secs.is_some_and(|expires| expires <= crate::now_unix_secs());
     let pinned_scene = accepted.and_then(|accepted| accepted.scene);

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
-use crate::fetch::{AddedRoot, FirstRoot, accepted, add_root};
+use crate::fetch::{AddedRoot, FetchError, FirstRoot, accepted, add_root};
 use clap::{ArgGroup, Args, Subcommand};
 use slag_common::files;
 use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
@@ -82,15 +82,21 @@ pub fn run(command: TrustCommand) -> Result<(), Failure> {
 
 fn add(args: AddArgs) -> Result<(), Failure> {
     let from = args.from.unwrap_or_default();
-    let root = match (args.root, args.sha256) {
-        (Some(path), _) => FirstRoot::Bytes(files::read_short(&path, MAX_ROOT_BYTES)?),
+    let root = match (&args.root, args.sha256) {
+        (Some(path), _) => FirstRoot::Bytes(files::read_short(path, MAX_ROOT_BYTES)?),
         (None, Some(sha256)) => FirstRoot::Sha256 { from, sha256 },
         (None, None) => FirstRoot::Any { from },
     };
     let cache = args.cache.open()?;
     let cancel = AtomicBool::new(false);
     let added = add_root(&cache, &root, args.replace, &environment(args.ca.as_deref(), &cancel, &()))
-        .map_err(failure)?;
+        .map_err(|error| match (error, &args.root) {
+            (FetchError::Tuf(error), Some(path)) => {
+                let file = path.display().to_string();
+                Failure::Failed("fetch", anyhow::Error::new(error).context(file))
+            }
+            (error, _) => failure(error),
+        })?;
     if args.json {
         return print_json(&added);
     }
@@ -100,7 +106,7 @@ fn add(args: AddArgs) -> Result<(), Failure> {
 }
 
 fn show(args: ShowArgs) -> Result<(), Failure> {
-    let accepted = accepted(&args.cache.open()?);
+    let accepted = accepted(&args.cache.open()?).map_err(|e| failure(e.into()))?;
     if args.json {
         return print_json(&accepted);
     }

@@ -51,7 +51,7 @@ pub enum FetchError {
     #[error("{from} has no root with SHA-256 {sha256}; check the hash and the address")]
     NoSuchRoot { from: String, sha256: String },
     #[error(
-        "the store offers scene {offered:?}, this robot expects {expected:?}; check the address, or change the robot's scene once with `slag-edge fetch --scene NAME`"
+        "the store offers scene {offered:?}, this robot expects {expected:?}; check the address, or change the robot's scene once with `slag-edge fetch --scene {offered:?}`"
     )]
     Scene { expected: String, offered: String },
     #[error(

@@ -167,7 +167,9 @@ fn scene_height(manifest: &Manifest, point: DVec3) -> f64 {
 pub enum PlanError {
     #[error("{name} is {value}, expected {expected}")]
     Number { name: &'static str, value: f64, expected: &'static str },
-    #[error("scene {scene:?} has no geo-reference; give the position as x, y, z in its world frame")]
+    #[error(
+        "scene {scene:?} has no geo-reference; give the position in its world frame: --at X,Y,Z, or `x y z` on a line"
+    )]
     NoGeoReference { scene: String },
     #[error(
         "scene {scene:?} has no cell within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or increase the radius"

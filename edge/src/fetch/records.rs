@@ -153,22 +153,23 @@ impl Records {
     }
 }
 
-/// Returns the accepted state, without the lock; `None` before the first trust, or if the records are damaged.
-pub fn accepted(cache: &EdgeCache) -> Option<Accepted> {
-    match read(cache, &copies_of(cache)) {
-        Ok(Read::Record(_, record)) => {
-            let Record { scene, kept, .. } = *record;
-            let kept = kept?;
-            Some(Accepted {
-                scene,
-                root_sha256: sha256_hex(kept.root.as_bytes()),
-                root_version: kept.root_version()?,
-                signed_unix_secs: kept.signed_unix_secs(),
-                expires_unix_secs: kept.expires_unix_secs(),
-            })
-        }
-        _ => None,
-    }
+/// Returns the accepted state, without the lock; `None` before the first trust.
+pub fn accepted(cache: &EdgeCache) -> Result<Option<Accepted>, RecordsError> {
+    let copies = copies_of(cache);
+    let Record { scene, kept, .. } = match read(cache, &copies)? {
+        Read::Nothing => return Ok(None),
+        Read::Damaged(what) => return Err(RecordsError::Damaged { path: copies.dir, what }),
+        Read::Record(_, record) => *record,
+    };
+    Ok(kept.and_then(|kept| {
+        Some(Accepted {
+            scene,
+            root_sha256: sha256_hex(kept.root.as_bytes()),
+            root_version: kept.root_version()?,
+            signed_unix_secs: kept.signed_unix_secs(),
+            expires_unix_secs: kept.expires_unix_secs(),
+        })
+    }))
 }
 
 /// Returns the position of the last fetch, without the lock.

@@ -19,7 +19,8 @@ use crate::query::RequestError;
 
 /// Longest body; a position needs a tenth.
 pub const MAX_BODY_BYTES: usize = 1024;
-const EXPECTED: &str = r#"{"x":..,"y":..,"z":..} or {"lat":..,"lon":..,"height":..}"#;
+const EXPECTED: &str =
+    r#"{"x":..,"y":..,"z":..} or {"lat":..,"lon":..,"height":..}, or as text `x y z` or `lat,lon[,height]`"#;
 
 /// The position as the follower takes it.
 #[derive(Serialize, JsonSchema)]
@@ -40,6 +41,13 @@ pub async fn position(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Acc
     let text = String::from_utf8_lossy(&body);
     let refused = |e: NotAPosition| RequestError::new("body", &e.found, EXPECTED);
     let position: Position = text.parse().map_err(refused)?;
+    // Before the first fetch no scene tells.
+    if let (Position::Geographic { .. }, Ok(snapshot)) = (position, app.engine.snapshot())
+        && snapshot.manifest.geo_reference.is_none()
+    {
+        let expected = r#"x, y, z in the world frame, as {"x":..,"y":..,"z":..} or `x y z`, since the scene has no geo-reference"#;
+        return Err(RequestError::new("body", &text, expected).into());
+    }
     // Kept even while nobody follows: the next follower starts from it.
     following.post(position);
     match following.failure() {

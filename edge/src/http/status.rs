@@ -63,7 +63,7 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<ServiceStatus>, 
         let error = on_board
             .as_ref()
             .map_or_else(|e| Some(e.to_string()), |on_board| on_board.check().err().map(|e| e.to_string()));
-        let accepted = accepted(app.engine.cache());
+        let accepted = accepted(app.engine.cache()).ok().flatten();
         let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
         // An expired scene still answers: an old map is better than none, if the client can tell.
         let is_expired = expires_unix_secs.is_some_and(|expires| expires <= crate::now_unix_secs());

@@ -422,6 +422,13 @@ async fn positions_are_handed_on_or_refused() {
     ] {
         assert_refused(&say(&app, bad).await, "body", bad);
     }
+    // The scene on board has no place on the earth: nothing is read as degrees.
+    app.reload_now();
+    for degrees in ["3,2,0", r#"{"lat":46.8,"lon":-92}"#] {
+        assert_refused(&say(&app, degrees).await, "body", degrees);
+    }
+    let (_, _, body) = say(&app, "here").await;
+    assert!(body["expected"].as_str().is_some_and(|forms| forms.contains("`x y z`")), "{body:#}");
     let (status, _, body) = say(&app, &"1".repeat(100_000)).await;
     assert_eq!((status.as_u16(), &body["type"]), (413, &"urn:slag:problem:body-too-large".into()));
     assert_eq!(following.status().position, Some(at), "what is refused changes nothing");

@@ -132,7 +132,7 @@ fn first_trust_is_a_step_of_its_own() {
     let error = robot.fetch().expect_err("nothing is trusted");
     assert!(matches!(error, FetchError::NoTrust { .. }), "{error}");
     assert_eq!(server.take_seen().len(), 0, "nothing is asked");
-    assert_eq!(accepted(&robot.cache), None);
+    assert!(matches!(accepted(&robot.cache), Ok(None)));
 
     let second_root = published.metadata["2.root.json"].clone();
     let by_hash = |sha256: String| FirstRoot::Sha256 { from: server.url(), sha256 };
@@ -150,7 +150,7 @@ fn first_trust_is_a_step_of_its_own() {
     let report = robot.fetch().expect("works");
     assert_eq!((report.root_version, report.is_first_contact), (2, false));
     assert_holds(&robot.snapshot(), &published, 0..3);
-    let kept = accepted(&robot.cache).expect("recorded");
+    let kept = accepted(&robot.cache).expect("reads").expect("recorded");
     assert_eq!((kept.scene.as_deref(), kept.root_version), (Some("yard"), 2));
     assert_eq!(kept.root_sha256, sha256_hex(&second_root));
 }
@@ -160,6 +160,8 @@ fn first_trust_is_a_step_of_its_own() {
 fn without_a_whole_copy_no_store_is_believed() {
     let mut rotated = Rotated::new();
     rotated.damage_both_copies();
+    let shown = accepted(&rotated.robot.cache);
+    assert!(matches!(shown, Err(RecordsError::Damaged { .. })), "{shown:?}");
     rotated.server.publish(of(2, &[FIRST, SECOND]));
     for trust_first in [false, true] {
         rotated.robot.request.trust_first = trust_first;

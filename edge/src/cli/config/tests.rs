@@ -71,6 +71,7 @@ fn flags_of_a_file_need_and_exclude_others() {
     let radius = [("SLAG_EDGE_QUERY_RADIUS", "0.5")];
     for (line, environment, file, expected) in [
         ("slag-edge query chair", &radius[..], "", "SLAG_EDGE_QUERY_RADIUS: needs --near <X,Y,Z> as well"),
+        ("slag-edge query chair", &[("SLAG_EDGE_QUERY_JSON", "1")], "", "[possible values: true, false]"),
         ("slag-edge list", &[], "[list]\nradius = 3", "edge.toml: list.radius: needs --near"),
         (
             "slag-edge locate a.jpg",

@@ -63,6 +63,9 @@ async fn generations_are_compared_over_http() {
         );
         assert!(read.vector.iter().zip(&written.vector).all(|(a, b)| (a - b).abs() < 0.01), "{read:?}");
     }
+    // The first generation has none before it, not even where one is named.
+    let (_, _, first) = service.get("/v1/changes?from=1").await;
+    assert_eq!(first["none"]["kind"], "no-earlier-generation", "{first:#}");
     // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor. The encoder's
     // clock has gone back: generations are ordered by number.
     let later = shards(&[6, 22, 33]);

@@ -124,7 +124,8 @@ async fn map(State(app): State<Arc<App>>) -> Result<Json<MapStatus>, Problem> {
     app.blocking(|app| {
         app.reload_if_stale();
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let expires_unix_secs = accepted(app.engine.cache()).and_then(|accepted| accepted.expires_unix_secs);
+        let expires_unix_secs =
+            accepted(app.engine.cache()).ok().flatten().and_then(|accepted| accepted.expires_unix_secs);
         Ok(Json(map_status(&snapshot, crate::now_unix_secs(), expires_unix_secs)))
     })
     .await
