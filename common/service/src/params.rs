@@ -121,7 +121,9 @@ impl<T: DeserializeOwned> Params<T> {
                 *name != error.parameter && name.eq_ignore_ascii_case(&error.parameter)
             };
             match pairs.iter().find(is_like) {
-                Some((name, value)) => RequestError::new(&shown(name), value, error.parameter),
+                Some((name, value)) => {
+                    RequestError::new(&shown(name), value, format!("the name {}", error.parameter))
+                }
                 None => error,
             }
         };

@@ -2,7 +2,7 @@
 
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TufError {
-    #[error("{role} metadata: {what}; check that the address is that of a slag-encoder store")]
+    #[error("{role} metadata: {what}; check that the address or file is that of a slag-encoder store")]
     Format { role: String, what: String },
     #[error(
         "{role} metadata: {found} of its keys signed it, expected {threshold}: it was changed, or this is not the store that is trusted. If the store was made anew: `slag-edge trust add URL --sha256 HEX --replace`, with the SHA-256 of its `slag-encoder keys status`"
