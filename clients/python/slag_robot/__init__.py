@@ -82,12 +82,13 @@ class Event:
 
 
 def thing(name: str, relation: Optional[Mapping[str, Any]] = None, **pick: Any) -> dict[str, Any]:
-    """Makes a phrase: `thing("box", relation("left-of", thing("door")), by="largest")`."""
+    """Makes a phrase: `thing("box", relation("left-of", thing("door")), by="largest")`, or
+    `thing("box", by="nearest", from_=thing("door"))`."""
     phrase: dict[str, Any] = {"thing": name}
     if relation is not None:
         phrase["relation"] = dict(relation)
     if pick:
-        phrase["pick"] = pick
+        phrase["pick"] = {name.rstrip("_"): value for name, value in pick.items()}
     return phrase
 
 
@@ -198,7 +199,10 @@ def _read(kind: Any, value: Any) -> Any:
         hints = _hints(kind)
         keys = {name: _NAMES.get(name, name) for name in hints}
         made = {name: _read(hints[name], value[key]) for name, key in keys.items() if key in value}
-        return kind(**made, **({"more": value} if "more" in hints else {}))
+        try:
+            return kind(**made, **({"more": value} if "more" in hints else {}))
+        except TypeError as error:
+            raise SlagError(200, {"detail": f"an answer lacks members; is the robot's program older? {error}"}) from None
     if not parts or value is None:
         return value
     if get_origin(kind) is Union:
@@ -249,6 +253,8 @@ class Robot:
             yield from page["objects"]
             if page["next_after"] is None:
                 return
+            if page["next_after"] == parameters.get("after"):
+                raise SlagError(200, {"detail": f"the page after {page['next_after']!r} repeats itself"})
             parameters["after"] = page["next_after"]
 
     def object(self, id: str) -> dict[str, Any]:
@@ -285,6 +291,8 @@ class Robot:
     def changes(self, texts: Sequence[str] = (), near: Optional[Point] = None, **parameters: Any) -> Changes:
         """Returns what changed between two generations: from_, to, radius as `GET /v1/changes` takes them.
         `texts`: kinds of things; each changed thing names the one that it is most like."""
+        if isinstance(texts, str):
+            texts = [texts]
         pairs = [("text", text) for text in texts] + _pairs(near, parameters)
         reply = self._send("/v1/changes?" + urllib.parse.urlencode(pairs), members=("from", "to", "frame", "none"))
         earlier = None if reply["from"] is None else reply["from"]["generation"]
@@ -329,7 +337,7 @@ class Robot:
     def _open(self, path: str, body: Optional[Mapping[str, Any]], timeout_secs: float) -> Any:
         request = urllib.request.Request(self.url + path)
         if body is not None:
-            request.data = json.dumps(body).encode()
+            request.data = json.dumps(body, allow_nan=False).encode()
             request.add_header("Content-Type", "application/json")
         if self.token is not None:
             # A redirect must not take it to another machine.

@@ -102,6 +102,11 @@ def what_is_no_answer_is_an_error(robot: Robot) -> None:
         raise AssertionError("pages of two generations are no list")
     except RuntimeError as error:
         assert "generation 7 became 8" in str(error), error
+    for _ in range(2):
+        ANSWERS.append((200, {}, b'{"generation": 7, "objects": [], "next_after": "o1"}'))
+    assert "'o1' repeats" in error_of(lambda: list(robot.objects())).detail
+    ANSWERS.append((200, {}, b'{"generation": 7, "results": []}'))
+    assert "lacks members" in error_of(lambda: robot.ask(texts=["chair"])).detail
     ANSWERS.append((200, {}, b'{"other": 1}'))
     assert "objects, next_after" in error_of(lambda: list(robot.objects())).detail
     ANSWERS.append((200, {"Content-Type": "text/event-stream"}, b"data: {no\n\n"))
@@ -131,6 +136,7 @@ def main() -> None:
         (lambda: robot.floor(near=earth), {"near_lat_lon": "46.8,-92.0,180.0"}),
         (lambda: robot.goal("chair", near=earth), {"text": "chair", "near_lat_lon": "46.8,-92.0,180.0"}),
         (lambda: robot.goal(id="o1", near=(0, 0, 0)), {"id": "o1", "near": "0,0,0"}),
+        (lambda: robot.changes("chair"), {"text": "chair"}),
         (lambda: robot.changes(["a"], near=earth, from_=3), {"text": "a", "from": "3", "near_lat_lon": "46.8,-92.0,180.0"}),
     ]
     for call, expected in calls:
@@ -148,6 +154,7 @@ def main() -> None:
     assert (refused.status, len(ASKED), TOKENS) == (302, 1, ["Bearer secret"]), "a redirect is not followed"
     assert "redirect to '/elsewhere'" in refused.detail, refused.detail
     what_is_no_answer_is_an_error(robot)
+    assert slag_robot.thing("box", by="nearest", from_={"thing": "door"})["pick"] == {"by": "nearest", "from": {"thing": "door"}}
     for wrong in [{"lat": 1.0}, {"x": 1.0, "y": 2.0}, {"lat": 1.0, "lon": 2.0, "alt": 3.0}]:
         try:
             robot.goal("chair", near=wrong)

@@ -3,13 +3,13 @@
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
 use slag_robot::api::goal::{Goal, GoalMiss, GoalReply, NoGoal, TargetThing};
-use slag_robot::xyz;
+use slag_robot::{parse_public_id, xyz};
 
 /// A thing to go to, and the robot that goes.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Going {
-    /// A thing in a few words, as for `find`.
+    /// A thing in a few words, as for `find`, or the id of a thing on board.
     #[schemars(length(min = 1, max = 512))]
     pub what: String,
     /// Where the robot is, [x, y, z] in the world frame. Absent: where the robot itself says it is.
@@ -97,7 +97,8 @@ impl Going {
             number("reach_m", self.reach_m),
             number("sensor_height_m", self.sensor_height_m),
         ];
-        [Some(("text", self.what.clone())), near].into_iter().chain(robot).flatten().collect()
+        let of = if parse_public_id(&self.what).is_some() { "id" } else { "text" };
+        [Some((of, self.what.clone())), near].into_iter().chain(robot).flatten().collect()
     }
 }
 

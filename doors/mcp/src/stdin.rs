@@ -121,11 +121,15 @@ impl<R: AsyncRead + Unpin> AsyncRead for ShortTexts<R> {
             let mut piece = [0; PIECE_BYTES];
             let mut piece = ReadBuf::new(&mut piece);
             ready!(Pin::new(&mut this.input).poll_read(context, &mut piece))?;
-            if piece.filled().is_empty() {
+            if piece.filled().is_empty() && this.place.n_bytes == 0 {
                 return Poll::Ready(Ok(()));
             }
             this.kept.clear();
             this.n_given = 0;
+            if piece.filled().is_empty() {
+                // The library drops a last line without its end.
+                this.go_on_by(b'\n');
+            }
             for byte in piece.filled() {
                 this.go_on_by(*byte);
             }
@@ -176,6 +180,14 @@ mod tests {
                 assert_eq!((n_chars, &first["id"]), (Some(50), &Value::from(7)), "{unit}");
                 assert_eq!(second, short, "{unit}");
             }
+        }
+    }
+
+    /// `printf` and pipes leave the end of the last line out.
+    #[test]
+    fn the_last_line_ends() {
+        for (input, expected) in [("{}\n{}", "{}\n{}\n"), ("{}\n", "{}\n"), ("", "")] {
+            assert_eq!(read(input, 2, 50, 9999), expected);
         }
     }
 

@@ -10,4 +10,5 @@ pub use client::{Robot, xyz};
 pub use error::RobotError;
 pub use reply::{Answer, Nothing, PointAnswer, Reply, Results, Witness};
 pub use slag_api as api;
+pub use slag_common::objects::parse_public_id;
 pub use slag_common::{durable, note};

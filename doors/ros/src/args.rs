@@ -3,6 +3,7 @@
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
+use clap::builder::NonEmptyStringValueParser;
 use clap::{Parser, ValueEnum};
 use slag_robot::RobotArgs;
 
@@ -17,7 +18,7 @@ pub struct Args {
     #[arg(long, default_value = "slag")]
     pub(crate) name: String,
     /// DDS domain.
-    #[arg(long, default_value_t = 0, env = "ROS_DOMAIN_ID")]
+    #[arg(long, default_value_t = 0, env = "ROS_DOMAIN_ID", value_parser = clap::value_parser!(u16).range(..=232))]
     pub(crate) domain_id: u16,
     /// Address of an interface to use; all if absent. May be repeated.
     #[arg(long, value_name = "IP")]
@@ -45,20 +46,20 @@ pub struct Args {
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) limit: u32,
     /// Radius of the robot seen from above, metres, for places to stand.
-    #[arg(long, value_name = "M", default_value_t = 0.3)]
+    #[arg(long, value_name = "M", default_value = "0.3", value_parser = parse_metres)]
     pub(crate) robot_radius: f64,
     /// Height of its sensor above the ground, metres.
-    #[arg(long, value_name = "M", default_value_t = 0.4)]
+    #[arg(long, value_name = "M", default_value = "0.4", value_parser = parse_metres)]
     pub(crate) sensor_height: f64,
     /// How close its middle must come to a thing's surface, metres.
-    #[arg(long, value_name = "M", default_value_t = 0.8)]
+    #[arg(long, value_name = "M", default_value = "0.8", value_parser = parse_metres)]
     pub(crate) reach: f64,
     /// Where places to stand are sent to, besides the node's own topic, so that Nav2 drives there.
     #[arg(long, default_value = "none")]
     pub(crate) send_goals: Goals,
     /// Namespace of a camera, such as /camera: its rectified photos (image_rect/compressed, camera_info) tell where
     /// the robot is, if the scene was encoded with --locate.
-    #[arg(long, value_name = "NAMESPACE")]
+    #[arg(long, value_name = "NAMESPACE", value_parser = NonEmptyStringValueParser::new())]
     pub(crate) camera: Option<String>,
     /// Frame that odometry keeps: --camera publishes the scene's place in it.
     #[arg(long, value_name = "FRAME", default_value = "odom")]
@@ -114,4 +115,26 @@ impl Args {
 fn parse_seconds(text: &str) -> Result<Duration, String> {
     let seconds = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
     seconds.ok_or_else(|| "expected seconds, 0 or more".to_owned())
+}
+
+fn parse_metres(text: &str) -> Result<f64, String> {
+    let metres = text.parse().ok().filter(|metres: &f64| (0.0..=1000.0).contains(metres));
+    metres.ok_or_else(|| "expected metres, 0 to 1000".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Ports of DDS end at domain 232 (RTPS 9.6.2.3).
+    #[test]
+    fn odd_values_are_refused_at_the_start() {
+        let parsed = |flag: &str, value: &str| Args::try_parse_from(["slag-ros", flag, value]).is_ok();
+        assert!(parsed("--domain-id", "232") && parsed("--reach", "0") && parsed("--camera", "/camera"));
+        for (flag, value) in
+            [("--domain-id", "233"), ("--robot-radius", "nan"), ("--sensor-height", "-1"), ("--camera", "")]
+        {
+            assert!(!parsed(flag, value), "{flag} {value}");
+        }
+    }
 }
