@@ -7,8 +7,8 @@ use image::{Rgb, RgbImage};
 use slag_common::photo::PhotoError;
 use slag_common::{Distortion, Intrinsics, View, pinhole, poses};
 use slag_encoder::ingest::{
-    GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, drawn_from, load_image, missing_images,
-    read_geo_reference,
+    GeoError, IngestError, OddPhotos, Oddity, Undistorter, check_memory, drawn_from, load_image,
+    missing_images, read_geo_reference,
 };
 use slag_test_support::{needs_shared, shared};
 
@@ -193,6 +193,18 @@ fn sizes_that_are_a_scale_bring_the_camera_along() {
 const EXIF: &[u8] =
     b"\xFF\xE1\x00\x22Exif\0\0MM\0\x2A\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
 
+/// A coefficient of another lens: little but the photo's middle is left, and it is told.
+#[test]
+fn lens_models_that_leave_little_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.png");
+    RgbImage::from_pixel(160, 120, Rgb([90; 3])).save(&path).unwrap();
+    for (k1, expected) in [(-0.1, None), (-20.0, Some(Oddity::Narrowed))] {
+        let lens = Distortion::Brown { k: [k1, 0.0, 0.0], p: [0.0; 2] };
+        assert_eq!(load_image(&view(&path, camera(lens))).unwrap().oddity, expected, "{k1}");
+    }
+}
+
 /// EXIF orientation is ignored, because COLMAP reads pixels as they are stored.
 #[test]
 fn exif_orientation_is_ignored() {
@@ -203,12 +215,12 @@ fn exif_orientation_is_ignored() {
     let jpeg = fs_err::read(&path).unwrap();
     fs_err::write(&path, [&jpeg[..2], EXIF, &jpeg[2..]].concat()).unwrap();
     let rotated = load_image(&view(&path, camera(Distortion::None))).unwrap();
-    assert!(rotated.image == plain && rotated.is_rotated);
+    assert!(rotated.image == plain && rotated.oddity == Some(Oddity::Rotated));
     // Two thousand of them give one line.
-    let photos = RotatedPhotos::default();
-    assert_eq!(photos.line(), None);
+    let photos = OddPhotos::default();
+    assert!(photos.lines().is_empty());
     (0..2000).for_each(|_| photos.add(&rotated));
-    let line = photos.line().unwrap();
+    let [line] = &photos.lines()[..] else { panic!("one line") };
     assert!(line.starts_with("2000 photos have an EXIF orientation") && line.len() < 250, "{line}");
 }
 

@@ -97,10 +97,11 @@ impl Samples {
         Self { indices, width_px, views: Vec::new(), camera_positions: Vec::new() }
     }
 
-    /// Adds a view; its photo is copied only if it is a sample or the first view.
+    /// Adds a view; its photo is copied only if it is a sample, or none before it tells anything.
     pub(super) fn add(&mut self, index: usize, view: &CheckView) -> Result<(), CheckError> {
         self.camera_positions.push(view.view.camera_from_world.inverse().translation);
-        if self.views.is_empty() || self.indices.binary_search(&index).is_ok() {
+        let is_sample = self.indices.binary_search(&index).is_ok() || self.views.is_empty();
+        if is_sample || self.views.iter().all(CheckView::is_plain) && !view.is_plain() {
             self.views.push(at_width(view, self.width_px)?);
         }
         Ok(())
@@ -114,14 +115,19 @@ impl Samples {
         means: &Means,
         options: &CheckOptions,
     ) -> Result<Diagnosis, CheckError> {
-        let (given_psnr_db, n_pairs) = mean_psnr_db(&self.views, loaded, None, self.views.len())?;
-        let n_pairs = n_pairs.min(scene.len() * self.views.len() * MOST_PAIRS_EACH);
+        // A plain photo looks exactly like a drawing that sees nothing.
+        let mut samples: Vec<&CheckView> = self.views.iter().filter(|view| !view.is_plain()).collect();
+        if samples.is_empty() {
+            samples = self.views.iter().collect();
+        }
+        let (given_psnr_db, n_pairs) = mean_psnr_db(&samples, loaded, None, samples.len())?;
+        let n_pairs = n_pairs.min(scene.len() * samples.len() * MOST_PAIRS_EACH);
         let search = Search {
-            samples: &self.views,
+            samples: &samples,
             scene,
             loaded,
             rasterizer,
-            flat_psnr_db: mean(self.views.iter().map(CheckView::flat_psnr_db)),
+            flat_psnr_db: mean(samples.iter().map(|view| view.flat_psnr_db())),
             given_psnr_db,
             pairs_left: Cell::new(n_pairs.saturating_mul(1000).saturating_add(MAX_PAIRS)),
             suspected: options.suspicions.iter().filter_map(|suspicion| suspicion.mistake).collect(),
@@ -149,7 +155,7 @@ impl Samples {
 /// Mean PSNR of the samples, dB, and the number of drawn pairs of a tile and a Gaussian. Ends after `n_first` samples
 /// if none of them looks more like its photo than a plain colour.
 fn mean_psnr_db(
-    samples: &[CheckView],
+    samples: &[&CheckView],
     scene: &dyn LoadedScene,
     mistake: Option<Mistake>,
     n_first: usize,
@@ -160,7 +166,7 @@ fn mean_psnr_db(
             break;
         }
         let view = mistake.map_or(sample.view, |mistake| mistake.corrected(&sample.view));
-        let drawing = CheckView { view, ..sample.clone() }.draw(scene)?;
+        let drawing = CheckView { view, ..(*sample).clone() }.draw(scene)?;
         let psnr_db = sample.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
         is_like |= psnr_db > sample.flat_psnr_db();
         (sum, n, n_pairs) = (sum + psnr_db, n + 1, n_pairs.saturating_add(drawing.counters.pairs));
@@ -170,7 +176,7 @@ fn mean_psnr_db(
 
 /// The search for the correction with which drawings match photos best.
 struct Search<'a> {
-    samples: &'a [CheckView],
+    samples: &'a [&'a CheckView],
     scene: &'a Gaussians,
     loaded: &'a dyn LoadedScene,
     rasterizer: &'a dyn Rasterizer,

@@ -19,7 +19,7 @@ use slag_common::{Gaussians, durable};
 use crate::ingest::IngestError;
 use crate::raster::{LoadedScene, Rasterizer};
 use diagnosis::{FLAWLESS_DB, Means, Samples};
-use view::{at_width, mean, picture, picture_name};
+use view::{PLAIN_DB, at_width, mean, picture, picture_name};
 
 pub(crate) use align::Alignment;
 pub use align::align;
@@ -30,9 +30,6 @@ pub use report::CheckReport;
 pub(crate) use report::ViewCheck;
 pub use suspicion::{Suspicion, suspicions};
 pub use view::{CheckView, psnr_db};
-
-/// A photo with this PSNR against its mean colour shows nothing, dB.
-const PLAIN_DB: f64 = 40.0;
 
 /// Draws the views of a scene and compares them with their photos.
 ///

@@ -60,7 +60,14 @@ pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
     -10.0 * mean(squares).max(1e-10).log10()
 }
 
+/// PSNR against the mean colour from which a photo is plain, as under a lens cap, and tells nothing of the others.
+pub(super) const PLAIN_DB: f64 = 40.0;
+
 impl CheckView {
+    pub(super) fn is_plain(&self) -> bool {
+        self.flat_psnr_db() >= PLAIN_DB
+    }
+
     /// Over the pixels that belong to the photo, dB.
     pub(super) fn psnr_db(&self, value: impl Fn(usize, usize) -> f32) -> f64 {
         let Some(valid) = &self.valid else { return psnr_db(&self.image, value) };

@@ -14,7 +14,7 @@ use super::next;
 use crate::check::{
     self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Suspicion,
 };
-use crate::ingest::{self, FoundFrame, IngestError, LoadedImage, RotatedPhotos};
+use crate::ingest::{self, FoundFrame, IngestError, LoadedImage, OddPhotos};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -117,8 +117,8 @@ fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
     let Inputs { scene, views, stated, frames, suspicions, mut notes, is_partial } = inputs;
     let n = (args.samples as usize).min(views.len());
     // Photos are loaded one at a time, when the check reaches them.
-    let rotated = RotatedPhotos::default();
-    let photos = (0..n).map(|i| load(&views[i * views.len() / n], &rotated));
+    let odd = OddPhotos::default();
+    let photos = (0..n).map(|i| load(&views[i * views.len() / n], &odd));
     let options = CheckOptions {
         width_px: args.raster_width,
         pictures_dir: args.out.clone(),
@@ -128,7 +128,7 @@ fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
     };
     let devices = Devices::open(&args.device, GpuOptions::default())?;
     let mut report = check::check(&scene, photos, &devices, &options)?;
-    rotated.warn();
+    odd.warn();
     if let (true, Some(first)) = (args.input.strict, report.unreadable.first()) {
         return Err(anyhow!("{first}"));
     }
@@ -158,10 +158,10 @@ fn with_photos(views: Vec<View>, is_strict: bool, notes: &mut Vec<String>) -> Re
     Ok(there)
 }
 
-fn load(view: &View, rotated: &RotatedPhotos) -> Result<CheckView, IngestError> {
+fn load(view: &View, odd: &OddPhotos) -> Result<CheckView, IngestError> {
     ingest::check_memory(view, free_memory_bytes().unwrap_or(u64::MAX))?;
     let loaded = ingest::load_image(view)?;
-    rotated.add(&loaded);
+    odd.add(&loaded);
     let LoadedImage { view, image, valid, .. } = loaded;
     let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());
     let valid = bytes.and_then(|bytes| GrayImage::from_raw(image.width(), image.height(), bytes));

@@ -19,7 +19,7 @@ use super::settings::{Regions, ViewSettings};
 use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
 use crate::embed::{self, PatchUse, SharedEncoders, Surroundings};
-use crate::ingest::{self, LoadedImage, RotatedPhotos};
+use crate::ingest::{self, LoadedImage, OddPhotos};
 use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
@@ -54,7 +54,7 @@ pub(crate) struct ViewStages<'a> {
     encoders: Encoders,
     /// Device of the image model, once open.
     images_on: Arc<OnceLock<Option<String>>>,
-    rotated: RotatedPhotos,
+    odd_photos: OddPhotos,
     /// Most Gaussians in a view whose ellipses overflow the device's numbers.
     n_unrepresentable: AtomicUsize,
 }
@@ -212,7 +212,7 @@ impl<'a> ViewStages<'a> {
             preprocess,
             encoders,
             images_on,
-            rotated: RotatedPhotos::default(),
+            odd_photos: OddPhotos::default(),
             n_unrepresentable: AtomicUsize::new(0),
         }
     }
@@ -235,7 +235,7 @@ impl<'a> ViewStages<'a> {
     }
 
     pub(super) fn warn(&self) {
-        self.rotated.warn();
+        self.odd_photos.warn();
         let n = self.n_unrepresentable.load(Ordering::Relaxed);
         if n > 0 {
             let is_on_gpu = self.tools.scene.gpus().is_some();
@@ -274,7 +274,7 @@ impl<'a> ViewStages<'a> {
 
     fn decode(&self, view: &View) -> Result<Photo, EncodeError> {
         let loaded = ingest::load_image(view)?;
-        self.rotated.add(&loaded);
+        self.odd_photos.add(&loaded);
         Ok(Photo { loaded, depth: None })
     }
 

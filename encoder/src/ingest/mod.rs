@@ -35,37 +35,50 @@ pub struct LoadedImage {
     pub undistorter: Option<Undistorter>,
     /// Opaque pixels inside the lens image, row-major; `None` if all are.
     pub valid: Option<Vec<bool>>,
-    /// Whether an EXIF orientation was ignored: poses are computed from the pixels as stored.
-    pub is_rotated: bool,
+    pub oddity: Option<Oddity>,
 }
 
-/// Counts photos with an EXIF orientation: a camera held upright makes thousands of them.
-#[derive(Debug, Default)]
-pub struct RotatedPhotos(Mutex<(usize, String)>);
+/// What is odd about a photo that is used all the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Oddity {
+    /// An EXIF orientation was ignored: poses are computed from the pixels as stored.
+    Rotated,
+    /// Its lens model leaves less than half of its pixels.
+    Narrowed,
+}
 
-impl RotatedPhotos {
+/// Counts odd photos, and keeps the first one's name: a camera held upright makes thousands of them.
+#[derive(Debug, Default)]
+pub struct OddPhotos(Mutex<[(usize, String); 2]>);
+
+impl OddPhotos {
     pub fn add(&self, photo: &LoadedImage) {
-        let mut rotated = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if photo.is_rotated {
-            rotated.0 += 1;
-            if rotated.0 == 1 {
-                rotated.1.clone_from(&photo.view.name);
-            }
+        let Some(oddity) = photo.oddity else { return };
+        let (n, first) = &mut self.0.lock().unwrap_or_else(PoisonError::into_inner)[oddity as usize];
+        *n += 1;
+        if *n == 1 {
+            first.clone_from(&photo.view.name);
         }
     }
 
     pub fn warn(&self) {
-        if let Some(line) = self.line() {
-            tracing::warn!("{line}");
-        }
+        self.lines().iter().for_each(|line| tracing::warn!("{line}"));
     }
 
-    pub fn line(&self) -> Option<String> {
-        let rotated = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let (n, first) = &*rotated;
-        (*n > 0).then(|| {
-            format!("{n} photos have an EXIF orientation, which is ignored; the first is {first}. If they fit badly, were their poses computed from rotated copies?")
-        })
+    pub fn lines(&self) -> Vec<String> {
+        let [rotated, narrowed] = &*self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let line = |(n, first): &(usize, String), rest: [&str; 2]| {
+            (*n > 0).then(|| format!("{n} photos {}; the first is {first}. {}", rest[0], rest[1]))
+        };
+        let of_rotated = [
+            "have an EXIF orientation, which is ignored",
+            "If they fit badly, were their poses computed from rotated copies?",
+        ];
+        let of_narrowed = [
+            "lose more than half of their pixels to their camera's lens model",
+            "Are its distortion coefficients those of this lens?",
+        ];
+        [line(rotated, of_rotated), line(narrowed, of_narrowed)].into_iter().flatten().collect()
     }
 }
 
@@ -150,9 +163,10 @@ pub fn check_memory(view: &View, free_bytes: u64) -> Result<(), IngestError> {
 ///
 /// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay
 /// unchanged. Transparent pixels are outside of the photo. An EXIF orientation is applied where only the turned
-/// photo has its camera's size, and else ignored, see [`RotatedPhotos`].
+/// photo has its camera's size, and else ignored, see [`Oddity`].
 pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     let (decoded, is_rotated) = decode(&view.image_path, &view.intrinsics)?;
+    let rotated = is_rotated.then_some(Oddity::Rotated);
     let intrinsics = view.intrinsics.scaled_to(decoded.width(), decoded.height());
     let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
     let or_blank = |loaded: LoadedImage| match &loaded.valid {
@@ -163,16 +177,18 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     };
     let (image, opaque) = photo::colours(decoded);
     if intrinsics.distortion == Distortion::None {
-        return or_blank(LoadedImage { view, image, undistorter: None, valid: opaque, is_rotated });
+        return or_blank(LoadedImage { view, image, undistorter: None, valid: opaque, oddity: rotated });
     }
     let undistorter = Undistorter::new(intrinsics);
     let (image, mut valid) = undistorter.image(&image);
+    let is_narrowed = 2 * valid.iter().filter(|valid| **valid).count() < valid.len();
+    let oddity = if is_narrowed { Some(Oddity::Narrowed) } else { rotated };
     if let Some(opaque) = opaque {
         let labels: Vec<u32> = opaque.into_iter().map(u32::from).collect();
         let opaque = undistorter.labels(&labels, 0);
         valid.iter_mut().zip(opaque).for_each(|(valid, opaque)| *valid &= opaque == 1);
     }
-    or_blank(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), is_rotated })
+    or_blank(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), oddity })
 }
 
 /// Returns the pixels, and whether an EXIF orientation was ignored.

@@ -98,7 +98,13 @@ fn planted_mistakes_are_diagnosed() {
     large.scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s * 10.0));
     // Refined by its drawings.
     let found = diagnosed(&large, &|_| {});
-    assert!(matches!(found, Some(Mistake::SceneScale(f)) if (f - 10.0).abs() < 0.05), "{found:?}");
+    let is_tenfold = |found| matches!(found, Some(Mistake::SceneScale(f)) if f64::abs(f - 10.0) < 0.05);
+    assert!(is_tenfold(found), "{found:?}");
+    // A black photo looks exactly like a drawing that sees nothing.
+    let mut capped = [views.clone(), views[..1].to_vec()].concat();
+    capped[2].image.fill(0);
+    let found = run(&large, &capped, &options).diagnosis.and_then(|diagnosis| diagnosis.mistake);
+    assert!(is_tenfold(found), "{found:?}");
 
     let double_focal = |view: &mut RasterView| {
         view.intrinsics.focal_x_px *= 2.0;

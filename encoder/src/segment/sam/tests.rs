@@ -531,7 +531,7 @@ fn masks_that_are_no_numbers_fail_the_view() {
         image: image::RgbImage::from_pixel(64, 48, image::Rgb([200; 3])),
         undistorter: None,
         valid: None,
-        is_rotated: false,
+        oddity: None,
     };
     let error = segmenter.segment(&SegmentInput::new(&loaded, None)).expect_err("no numbers").to_string();
     assert!(error.contains("view a.jpg: the mask model's output is not finite"), "{error}");
