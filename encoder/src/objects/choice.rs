@@ -25,12 +25,14 @@ const MIN_CONSENSUS: f64 = 0.3;
 /// A mask with a larger intersection over union shows the node: a majority of their union, so that no mask shows two
 /// disjoint nodes.
 const SAME_IOU: f64 = 0.5;
-/// An object needs a view with a mask of it whose outline the photo's edge cuts by at most a tenth.
-const WHOLE: f32 = 0.9;
+/// Uncut share of a mask's outline from which a view begins to show a node whole, and from which it does: indoors,
+/// photos of a wardrobe cut its top or its feet.
+const NEARLY_WHOLE: f64 = 0.75;
+const WHOLE: f64 = 0.9;
 /// Least share of an object, in tenths, that such a view sees: photos of ground show and outline a patch of it.
 const WHOLE_TENTHS: u64 = 2;
 /// One in this many judging views must show an object whole: a car park that 2 of 39 photos outline is none.
-const JUDGES_PER_WHOLE: usize = 11;
+const JUDGES_PER_WHOLE: f64 = 11.0;
 /// Factor of agreement with a mask of a standing thing: all views agree on it, also where things touch.
 const STANDING_TRUST: f64 = 0.75;
 /// Views of fewer pixels count proportionally less: one pixel of error spoils a small outline.
@@ -121,16 +123,17 @@ fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     let is_judge =
         |view: &&NodeView| !view.masks.is_empty() && u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS;
     let judges = views.values().filter(is_judge);
-    let (mut sum, mut weights, mut n_whole, mut n_judges) = (0.0, 0.0, 0_usize, 0_usize);
+    let (mut sum, mut weights, mut n_whole, mut n_judges) = (0.0, 0.0, 0.0, 0.0);
     for view in judges {
         let uncut = f64::from(view.uncut.max(LEAST_UNCUT));
         let weight = uncut * uncut * (view.weight_px / FULL_PX).min(1.0);
         (sum, weights) = (sum + weight * view.agreement, weights + weight);
-        n_judges += 1;
-        let sees_it = u64::from(view.n) * 10 >= u64::from(n) * WHOLE_TENTHS;
-        n_whole += usize::from(sees_it && view.agreement > SAME_IOU && view.uncut >= WHOLE);
+        n_judges += 1.0;
+        if u64::from(view.n) * 10 >= u64::from(n) * WHOLE_TENTHS && view.agreement > SAME_IOU {
+            n_whole += ((f64::from(view.uncut) - NEARLY_WHOLE) / (WHOLE - NEARLY_WHOLE)).clamp(0.0, 1.0);
+        }
     }
-    let is_whole = n_whole > 0 && JUDGES_PER_WHOLE * n_whole >= n_judges;
+    let is_whole = n_whole > 0.0 && JUDGES_PER_WHOLE * n_whole >= n_judges;
     if n < min_gaussians || !is_whole || sum < MIN_CONSENSUS * weights {
         return 0.0;
     }
@@ -245,6 +248,13 @@ mod tests {
         let views = |n: u32| (0..n).map(|at| (at, view(if at == 0 { 1.0 } else { 0.5 }))).collect();
         assert!((worth(&views(11), 16, 1) - 0.9_f64.powi(8) * 2.0).abs() < 1e-6);
         assert_eq!(worth(&views(12), 16, 1), 0.0);
+        // Cut a little, two count for one.
+        let half = |at: &mut NodeView| at.uncut = 0.825;
+        let mut nearly: NodeViews = views(11);
+        nearly.values_mut().take(2).for_each(half);
+        assert!(worth(&nearly, 16, 1) > 0.0);
+        nearly.values_mut().next().iter_mut().for_each(|view| view.uncut = 0.5);
+        assert_eq!(worth(&nearly, 16, 1), 0.0);
         // It sees a fifth of 50 Gaussians, and less of 51.
         assert!(worth(&views(11), 50, 1) > 0.0 && worth(&views(11), 51, 1) == 0.0);
     }
