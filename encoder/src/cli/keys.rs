@@ -10,6 +10,7 @@ use slag_common::tuf::format_utc;
 
 use super::common::{Exit, print, warn_of_expiry};
 use crate::store::ceremony::{Change, Changed, KeysStatus, default_root_folder, sign_draft};
+use crate::store::check_folder;
 use crate::store::metadata::{Metadata, MetadataReader, signing_unix_secs};
 
 /// `keys`.
@@ -121,6 +122,7 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
             if threshold > n_root_keys {
                 bail!("--threshold is {threshold} of {n_root_keys} root keys; expected at most as many");
             }
+            check_folder(&at.store)?;
             fs_err::create_dir_all(&at.store)?;
             let metadata = Metadata::open(&at.store)?;
             metadata.make_root(&at.root_folder(), *n_root_keys as usize, *threshold, now)?;

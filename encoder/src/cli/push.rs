@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 use super::common::{Exit, print, runtime, stopped};
 use crate::progress::Progress;
 use crate::publish::qdrant;
-use crate::store::Store;
+use crate::store::{Store, StoreReader};
 
 /// `push`.
 #[derive(Debug, Subcommand)]
@@ -28,6 +28,8 @@ pub struct QdrantArgs {
 }
 
 pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    // A mistyped path must not create a store.
+    StoreReader::open(&args.store)?;
     // A push keeps its state in the store, so it takes the writer's lock.
     let store = Store::create_or_open(&args.store)?;
     let reader = store.reader()?;

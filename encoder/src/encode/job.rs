@@ -15,7 +15,7 @@ use super::sink::{ViewRecord, ViewSink};
 use crate::lift::photos::{self, MaskOutline};
 use crate::lift::{ContributionError, ContributionFile, ViewContributions};
 use crate::segment::Segmenter;
-use crate::store::Store;
+use crate::store::{Store, remove_files};
 
 const TREE: &str = "job";
 const IDENTITY_KEY: &[u8] = b"identity";
@@ -227,12 +227,15 @@ impl Job {
         }
         self.records.apply_batch(batch)?;
         self.flush()?;
-        for entry in fs_err::read_dir(self.views_folder())? {
-            let path = entry?.path();
-            if !path.file_stem().and_then(|stem| stem.to_str()).is_some_and(|stem| own.contains(stem)) {
-                fs_err::remove_file(path)?;
-            }
-        }
+        self.remove_views(|id| !own.contains(id))
+    }
+
+    /// Removes the files of views, complete or not, by their identities.
+    fn remove_views(&self, is_chosen: impl Fn(&str) -> bool) -> Result<(), EncodeError> {
+        let id = |name: &str| Some(name.split_once('.')?.0.to_owned());
+        let is_of_view =
+            |name: &str| id(name).is_some_and(|id| id.parse::<Hash32>().is_ok() && is_chosen(&id));
+        remove_files(&self.views_folder(), is_of_view)?;
         Ok(())
     }
 
@@ -287,8 +290,10 @@ impl Job {
             self.records.clear()?;
             self.flush()?;
         }
-        if n_steps > 2 && self.folder.exists() {
-            fs_err::remove_dir_all(&self.folder)?;
+        if n_steps > 2 {
+            self.remove_views(|_| true)?;
+            // Other files in them are not ours.
+            let _ = fs_err::remove_dir(self.views_folder()).and_then(|()| fs_err::remove_dir(&self.folder));
         }
         Ok(())
     }

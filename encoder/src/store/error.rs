@@ -19,6 +19,11 @@ pub enum StoreError {
         records_help(cause, "if the database is damaged, remove this folder: published scenes stay, unfinished jobs start over")
     )]
     Records { path: PathBuf, cause: sled::Error },
+    #[error(
+        "{}: it is no store and has other files, the first is {found:?}; name a store, or a folder that is empty or new",
+        path.display()
+    )]
+    NotAStore { path: PathBuf, found: String },
     #[error("this machine's clock says a time before 1970; set it")]
     Clock,
     #[error("{} is missing: nothing has been published here yet; run `slag-encoder encode` first", path.display())]
@@ -34,8 +39,8 @@ pub enum StoreError {
     #[error("{}: {}; {}", path.display(), metadata_fault(cause), metadata_help(path))]
     Metadata { path: PathBuf, cause: TufError },
     #[error(
-        "{} is missing, but the store was signed by it; {ROOT_HELP}; without one, remove {}, encode again, and tell robots of the new root (`slag-edge trust add`)",
-        path.display(), path.parent().unwrap_or(path).display()
+        "{} is missing, but the store was signed by it; {ROOT_HELP}; without one, encode into a new store, and tell robots of its root (`slag-edge trust add`)",
+        path.display()
     )]
     RootLost { path: PathBuf },
     #[error("{}: robots refuse it: {what}", path.display())]
@@ -50,10 +55,14 @@ pub enum StoreError {
         found_bytes.map_or("nothing".into(), |n| format!("{n} bytes"))
     )]
     MissingObject { hash: Hash32, path: PathBuf, expected_bytes: u64, found_bytes: Option<u64> },
+    #[error("{}: it is missing; encode again, which writes it anew", path.display())]
+    ObjectLost { path: PathBuf },
     #[error("{}: content has hash {found}, not that of its name: the file is damaged; remove it and encode again", path.display())]
     ObjectHash { path: PathBuf, found: Hash32 },
     #[error("{}: {cause}; encode again: what is damaged is written anew", path.display())]
     Shard { path: PathBuf, cause: ContainerError },
+    #[error("{}: {what}; name another folder with --out, or move this away", path.display())]
+    ExportFolder { path: PathBuf, what: &'static str },
     #[error("{} has a root already; to change its keys, run `slag-encoder keys rotate` or `revoke`", store.display())]
     HasRoot { store: PathBuf },
     #[error("{} has no root yet; run `slag-encoder keys init`, or encode", store.display())]
@@ -96,6 +105,9 @@ fn by_the_system(error: &io::Error) -> Option<&'static str> {
     match error.kind() {
         Kind::StorageFull | Kind::QuotaExceeded => Some(FULL),
         Kind::PermissionDenied => Some("give this user the right to read and write there"),
+        Kind::IsADirectory | Kind::NotADirectory | Kind::DirectoryNotEmpty => {
+            Some("files and folders of other names than expected lie there; move them away")
+        }
         Kind::ReadOnlyFilesystem => Some("its disk takes no writes: mount it for writing, or use a copy"),
         _ => is_full().then_some(FULL),
     }

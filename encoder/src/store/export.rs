@@ -7,11 +7,12 @@
 //! | `v1/metadata/` | metadata of The Update Framework; robots follow `timestamp.json`, which is written last |
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::io;
+use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use serde::Serialize;
-use slag_common::tuf::TargetFile;
+use slag_common::tuf::{TargetFile, TufError};
 use slag_common::{Hash32, durable, manifest};
 
 use super::error::StoreError;
@@ -20,12 +21,14 @@ use super::metadata::clock_unix_secs;
 use super::reader::{Published, StoreReader};
 use super::walk::{self, Refused};
 
+const FIRST_ROOT: &str = "1.root.json";
+
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Exported {
     pub(crate) n_files: usize,
     pub(crate) len_bytes: u64,
     /// Objects removed that neither generation needs.
-    pub(crate) n_removed: usize,
+    pub(crate) n_removed: u64,
 }
 
 /// Writes what robots need of a store into a folder, or updates one. Robots that fetch meanwhile find the old
@@ -53,6 +56,7 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     };
     let folder = to.join("v1");
     let [objects, targets, of_metadata] = ["objects", "targets", "metadata"].map(|name| folder.join(name));
+    check_export(&folder, metadata.get(FIRST_ROOT))?;
     for folder in [&objects, &targets, &of_metadata] {
         fs_err::create_dir_all(folder)?;
     }
@@ -81,15 +85,45 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
         }
     }
     durable::write(&folder.join(manifest::TARGET), &reader.current().bytes)?;
-    let mut n_removed = 0;
-    for entry in fs_err::read_dir(&objects)? {
-        let entry = entry?;
-        let hash: Option<Hash32> = entry.file_name().to_str().and_then(|name| name.parse().ok());
-        if !hash.is_some_and(|hash| lens.contains_key(&hash)) {
-            fs_err::remove_file(entry.path())?;
-            n_removed += 1;
-        }
-    }
+    let is_left_over = |name: &str| name.parse().is_ok_and(|hash: Hash32| !lens.contains_key(&hash));
+    let (n_removed, _) = files::remove_files(&objects, is_left_over)?;
     let len_bytes = fresh.iter().map(|(_, len_bytes)| **len_bytes).sum();
     Ok(Exported { n_files: fresh.len(), len_bytes, n_removed })
+}
+
+/// Refuses a folder that has another store's export, or what no export has; hidden files may lie there. `root`: the
+/// store's first.
+fn check_export(folder: &Path, root: Option<&Result<Vec<u8>, TufError>>) -> Result<(), StoreError> {
+    let refuse = |path: PathBuf, what| Err(StoreError::ExportFolder { path, what });
+    for part in ["", "objects", "targets", "metadata"] {
+        let entries = match fs_err::read_dir(folder.join(part)) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => continue,
+            entries => entries?,
+        };
+        for entry in entries {
+            let entry = entry?;
+            let found = entry.file_name().to_string_lossy().into_owned();
+            let name = found.strip_suffix(".part").unwrap_or(&found);
+            let is_ours = match (part, entry.path().is_dir()) {
+                ("", true) => ["objects", "targets", "metadata"].contains(&name),
+                ("", false) => name == manifest::TARGET,
+                ("objects", false) => name.parse::<Hash32>().is_ok(),
+                ("targets", false) => name.ends_with(".manifest"),
+                ("metadata", false) => name.ends_with(".json"),
+                _ => false,
+            };
+            if !is_ours && !found.starts_with('.') {
+                return refuse(entry.path(), "no export of a store has this");
+            }
+        }
+    }
+    let path = folder.join("metadata").join(FIRST_ROOT);
+    let exported = match fs_err::read(&path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
+        exported => exported?,
+    };
+    match root {
+        Some(Ok(root)) if *root == exported => Ok(()),
+        _ => refuse(path, "robots follow another store here"),
+    }
 }

@@ -62,6 +62,27 @@ pub(super) fn ensure_folder_unsynced(path: &Path) -> io::Result<()> {
     }
 }
 
+/// Removes the files of a folder, if it exists, whose names are chosen; returns their number and bytes.
+pub(crate) fn remove_files(folder: &Path, is_chosen: impl Fn(&str) -> bool) -> io::Result<(u64, u64)> {
+    let entries = match fs_err::read_dir(folder) {
+        Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+            return Ok((0, 0));
+        }
+        entries => entries?,
+    };
+    let (mut n_files, mut len_bytes) = (0, 0);
+    for entry in entries {
+        let entry = entry?;
+        let metadata = entry.metadata()?;
+        if !metadata.is_dir() && entry.file_name().to_str().is_some_and(&is_chosen) {
+            fs_err::remove_file(entry.path())?;
+            n_files += 1;
+            len_bytes += metadata.len();
+        }
+    }
+    Ok((n_files, len_bytes))
+}
+
 pub(super) const MANIFEST: &str = "manifest";
 /// For fetches that began before the last publication.
 pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";

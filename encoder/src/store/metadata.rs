@@ -167,6 +167,12 @@ impl MetadataReader {
         Ok(None)
     }
 
+    /// Whether anything was ever published, which takes a root.
+    fn is_published(&self) -> Result<bool, StoreError> {
+        let is_there = |name: &&str| self.store.join(name).exists();
+        Ok([files::MANIFEST, files::MANIFEST_PREVIOUS].iter().any(is_there) || self.is_begun()?)
+    }
+
     fn is_begun(&self) -> Result<bool, StoreError> {
         let has = |role: &str| Ok::<_, StoreError>(!self.versions(role)?.is_empty());
         Ok(self.path(TIMESTAMP_FILE).exists() || has(Targets::TYPE)? || has(Snapshot::TYPE)?)
@@ -270,13 +276,28 @@ impl Metadata {
         Ok(Self { reader: MetadataReader::new(store), _lock: lock })
     }
 
-    /// Publishes a manifest, unless it is published already; makes keys and root the first time. `created_unix_secs`:
-    /// of the manifest; a later clock counts instead, because a reproducible manifest may be dated back.
-    pub(crate) fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
-        let now_unix_secs = created_unix_secs.max(signing_unix_secs());
-        if self.newest_root()?.is_none() {
-            self.make_root(&roles::root_folder(&self.store), 1, 1, now_unix_secs)?;
+    /// Makes keys and root before the first publication. `created_unix_secs`: as of [`Self::publish`].
+    pub(crate) fn ensure_root(&self, created_unix_secs: u64) -> Result<(), StoreError> {
+        if self.newest_root()?.is_some() {
+            return Ok(());
         }
+        let now_unix_secs = created_unix_secs.max(signing_unix_secs());
+        self.make_root(&roles::root_folder(&self.store), 1, 1, now_unix_secs)
+    }
+
+    /// Refuses a store without a root.
+    pub(crate) fn check_root(&self) -> Result<(), StoreError> {
+        match self.newest_root()? {
+            Some(_) => Ok(()),
+            None => Err(StoreError::RootLost { path: self.path("1.root.json") }),
+        }
+    }
+
+    /// Publishes a manifest, unless it is published already. `created_unix_secs`: of the manifest; a later clock counts
+    /// instead, because a reproducible manifest may be dated back.
+    pub(crate) fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
+        self.check_root()?;
+        let now_unix_secs = created_unix_secs.max(signing_unix_secs());
         let targets = targets_of(manifest);
         match self.published_by_newest()? {
             Some(published) if published.targets == targets => return Ok(()),
@@ -293,7 +314,7 @@ impl Metadata {
     pub(crate) fn check_keys(&self) -> Result<(), StoreError> {
         match self.newest_root()? {
             Some(_) => roles::ONLINE.into_iter().try_for_each(|role| self.key(role).map(drop)),
-            None if self.is_begun()? => Err(StoreError::RootLost { path: self.path("1.root.json") }),
+            None if self.is_published()? => self.check_root(),
             None => roles::check_before_root(&self.store),
         }
     }
@@ -332,9 +353,9 @@ impl Metadata {
         if self.newest_root()?.is_some() {
             return Err(StoreError::HasRoot { store: self.store.clone() });
         }
-        if self.is_begun()? {
+        if self.is_published()? {
             // Robots trust a root of this store, and a new one of its version would not follow it.
-            return Err(StoreError::RootLost { path: self.path("1.root.json") });
+            return self.check_root();
         }
         let (body, keys) = roles::make_all(&self.store, root_folder, n_root_keys, threshold)?;
         let keys: Vec<&SigningKey> = keys.iter().collect();

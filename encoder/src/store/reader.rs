@@ -34,9 +34,12 @@ impl Published {
         let (manifest, bytes) = read_manifest(&dir.join(name))?;
         let hash = Hash32::of(&bytes);
         let path = extras_path(dir, hash);
-        let extras = fs_err::read(&path)?;
-        let extras =
-            serde_json::from_slice(&extras).map_err(|e| StoreError::Extras { path, what: e.to_string() })?;
+        let damaged = |what| StoreError::Extras { path: path.clone(), what };
+        let extras = match fs_err::read(&path) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged("it is missing".into())),
+            extras => extras?,
+        };
+        let extras = serde_json::from_slice(&extras).map_err(|e| damaged(e.to_string()))?;
         Ok(Self { manifest, bytes, hash, extras })
     }
 
@@ -153,7 +156,10 @@ impl StoreReader {
 
     pub fn read_object(&self, hash: Hash32) -> Result<AlignedBytes, StoreError> {
         let path = self.object_path(hash);
-        let bytes = AlignedBytes::read(&path)?;
+        let bytes = match AlignedBytes::read(&path) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::ObjectLost { path }),
+            bytes => bytes?,
+        };
         match Hash32::of(&bytes) {
             found if found == hash => Ok(bytes),
             found => Err(StoreError::ObjectHash { path, found }),

@@ -433,3 +433,93 @@ fn a_manifest_of_another_version_is_kept() {
     assert!(matches!(refused, StoreError::SignedManifest { .. }), "{refused}");
     assert!(fs_err::read_to_string(&path).expect("there") == later);
 }
+
+/// A folder of other files is left as it is; a store that was begun goes on.
+#[test]
+fn a_folder_of_other_files_is_no_store() {
+    let dir = tempfile::tempdir().expect("a folder");
+    fs_err::create_dir_all(dir.path().join("tmp")).expect("made");
+    for name in ["photo.jpg", "tmp/notes"] {
+        fs_err::write(dir.path().join(name), "kept").expect("written");
+    }
+    let refused = Store::create_or_open(dir.path()).expect_err("is no store").to_string();
+    assert!(refused.contains("photo.jpg") && refused.contains("name a store"), "{refused}");
+    assert_eq!(fs_err::read_dir(dir.path()).expect("listed").count(), 2);
+    assert!(dir.path().join("tmp/notes").exists());
+
+    let begun = tempfile::tempdir().expect("a folder");
+    fs_err::create_dir(begun.path().join("objects")).expect("made");
+    Store::create_or_open(begun.path()).expect("goes on");
+}
+
+/// Files and folders of others within a store's folders stay, and are no error.
+#[test]
+fn files_of_others_stay_in_a_store() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let others =
+        ["notes", "tmp/notes", "tmp/a.part/b", "objects/notes", "objects/ab/notes", "extras/folder/b"];
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    store.publish(&manifest(1, &[]), &Extras::new()).expect("publishes");
+    let unlisted = store.put_bytes(b"unlisted").expect("room").0;
+    drop(store);
+    for path in others.map(|name| dir.path().join(name)) {
+        fs_err::create_dir_all(path.parent().expect("a folder")).expect("made");
+        fs_err::write(path, "kept").expect("written");
+    }
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    assert_eq!(store.prune().expect("prunes").n_files, 1);
+    assert!(!reader::object_path(dir.path(), unlisted).exists());
+    assert!(others.iter().all(|name| dir.path().join(name).exists()));
+}
+
+/// What is lost is named, and the next publication makes it anew.
+#[test]
+fn lost_extras_and_objects_are_named() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let publish = |generation| {
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        let object = store.put_bytes(b"shard").expect("puts");
+        store.publish(&manifest(generation, &[object]), &Extras::new()).expect("publishes");
+        object.0
+    };
+    let object = publish(1);
+    fs_err::remove_dir_all(dir.path().join("objects")).expect("there");
+    let reader = StoreReader::open(dir.path()).expect("reads");
+    let lost = reader.read_object(object).expect_err("lost").to_string();
+    assert!(lost.contains("it is missing; encode again"), "{lost}");
+    fs_err::remove_dir_all(dir.path().join("extras")).expect("there");
+    let lost = StoreReader::open(dir.path()).expect_err("lost").to_string();
+    assert!(lost.contains("it is missing; encode again"), "{lost}");
+    publish(2);
+    StoreReader::open(dir.path()).expect("reads").read_object(object).expect("is there again");
+}
+
+/// Robots that fetch from a folder follow one store.
+#[test]
+fn an_export_replaces_nothing_else() {
+    let [dir, other] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
+    for dir in [&dir, &other] {
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        store.publish(&manifest(1, &[]), &Extras::new()).expect("publishes");
+    }
+    let out = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| out.path().join("v1").join(name);
+    for name in ["objects/.nfs1", "objects/notes", "objects/folder/b", "index"] {
+        fs_err::create_dir_all(at(name).parent().expect("a folder")).expect("made");
+        fs_err::write(at(name), "kept").expect("written");
+        let exported = export(dir.path(), out.path());
+        if name == "objects/.nfs1" {
+            exported.expect("hidden files may lie there");
+            continue;
+        }
+        let refused = exported.expect_err(name).to_string();
+        assert!(refused.contains("no export of a store has this"), "{refused}");
+        match fs_err::remove_file(at(name)) {
+            Ok(()) if name.ends_with("/b") => fs_err::remove_dir(at("objects/folder")).expect("empty"),
+            removed => removed.expect("there"),
+        }
+    }
+    let refused = export(other.path(), out.path()).expect_err("another root").to_string();
+    assert!(refused.contains("1.root.json: robots follow another store here"), "{refused}");
+    export(dir.path(), out.path()).expect("the same store");
+}

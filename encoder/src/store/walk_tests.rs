@@ -111,14 +111,29 @@ fn metadata_is_signed_anew_and_no_version_goes_back() {
 #[test]
 fn a_lost_root_is_not_made_anew_in_silence() {
     let dir = store();
+    let aside = tempfile::tempdir().expect("a folder");
     for name in ["1.root.json", "2.root.json"] {
-        fs_err::remove_file(dir.path().join("metadata").join(name)).expect("there");
+        fs_err::rename(dir.path().join("metadata").join(name), aside.path().join(name)).expect("there");
     }
     let refused = publish(dir.path(), 3).expect_err("no root");
     assert!(matches!(refused, StoreError::RootLost { .. }), "{refused}");
     assert!(refused.to_string().contains("v1/metadata/"), "{refused}");
-    // As the error says.
-    fs_err::remove_dir_all(dir.path().join("metadata")).expect("there");
-    publish(dir.path(), 3).expect("publishes");
-    assert_eq!(walk::refused(dir.path()).expect("reads"), []);
+    // Nor where nothing but manifests, or the catalogue, tell that robots trust one.
+    for lost in [&["metadata"][..], &["manifest", "manifest.previous"]] {
+        lost.iter()
+            .for_each(|name| fs_err::rename(dir.path().join(name), aside.path().join(name)).expect("there"));
+        let refused = publish(dir.path(), 3).expect_err("no root");
+        assert!(matches!(refused, StoreError::RootLost { .. }), "{refused}");
+        let refreshed =
+            Metadata::open(dir.path()).and_then(|metadata| metadata.refresh(clock_unix_secs(), 9));
+        assert!(matches!(refreshed, Err(StoreError::RootLost { .. } | StoreError::NotPublished { .. })));
+    }
+    for name in ["metadata", "manifest", "manifest.previous"] {
+        let _ = fs_err::remove_dir_all(dir.path().join(name));
+        fs_err::rename(aside.path().join(name), dir.path().join(name)).expect("restores");
+    }
+    for name in ["1.root.json", "2.root.json"] {
+        fs_err::rename(aside.path().join(name), dir.path().join("metadata").join(name)).expect("restores");
+    }
+    publish(dir.path(), 3).expect("as the error says");
 }

@@ -1,6 +1,6 @@
 //! The only writer of a store.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -41,6 +41,7 @@ impl Store {
     /// # Errors
     /// [`StoreError::Locked`] while another process writes; [`StoreError`] otherwise.
     pub fn create_or_open(dir: &Path) -> Result<Self, StoreError> {
+        check_folder(dir)?;
         fs_err::create_dir_all(dir)?;
         for folder in ["objects", "extras", "keys", "tmp"] {
             files::ensure_folder(&dir.join(folder))?;
@@ -52,9 +53,7 @@ impl Store {
         files::sync_folder(&dir.join("objects"))?;
         let catalogue = Catalogue::open(dir, LOCK_PATIENCE)?;
         // The lock is held, so files in tmp/ belong to a dead writer.
-        for entry in fs_err::read_dir(dir.join("tmp"))? {
-            fs_err::remove_file(entry?.path())?;
-        }
+        files::remove_files(&dir.join("tmp"), |name| name.ends_with(".part"))?;
         let n_parts = AtomicU64::new(0);
         let store = Self { dir: dir.to_owned(), catalogue, n_parts, read: Mutex::default() };
         store.repair_records()?;
@@ -133,7 +132,16 @@ impl Store {
 
     /// The keys that sign the next generation must be there.
     pub(crate) fn check_keys(&self) -> Result<(), StoreError> {
-        Metadata::open(&self.dir)?.check_keys()
+        self.metadata()?.check_keys()
+    }
+
+    /// Refuses the metadata of a store that was published if its root is lost.
+    fn metadata(&self) -> Result<Metadata, StoreError> {
+        let metadata = Metadata::open(&self.dir)?;
+        if self.catalogue.last_generation()?.is_some() {
+            metadata.check_root()?;
+        }
+        Ok(metadata)
     }
 
     /// Signs a manifest and makes it, with its objects, the current one; returns its hash. Publishing the current
@@ -164,6 +172,9 @@ impl Store {
             }
             _ => {}
         }
+        let metadata = self.metadata()?;
+        // First, so that a manifest without a root is one whose root is lost.
+        metadata.ensure_root(manifest.created_unix_secs)?;
         let extras_json = serde_json::to_vec(extras).expect("a map of strings is JSON");
         self.replace(&reader::extras_path(&self.dir, hash), &extras_json)?;
         if !again {
@@ -172,7 +183,7 @@ impl Store {
             }
             self.replace(&path, &bytes)?;
         }
-        Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
+        metadata.publish(&bytes, manifest.created_unix_secs)?;
         self.catalogue.record(manifest, hash)?;
         Ok(hash)
     }
@@ -189,23 +200,18 @@ impl Store {
         let both = || std::iter::once(reader.current()).chain(reader.previous());
         let extras: BTreeSet<Hash32> = both().map(|published| published.hash).collect();
         let objects: BTreeSet<Hash32> = both().flat_map(Published::all_objects).collect();
-        let mut pruned = Pruned::default();
-        for (path, len_bytes) in files_in(&self.dir.join("extras"))? {
-            if !named_in(&path, &extras) {
-                pruned.len_bytes += len_bytes;
-                fs_err::remove_file(&path)?;
-            }
+        let is_of_none = |name: &str, kept: &BTreeSet<Hash32>| {
+            name.parse::<Hash32>().is_ok_and(|hash| !kept.contains(&hash))
+        };
+        let (_, mut len_bytes) =
+            files::remove_files(&self.dir.join("extras"), |name| is_of_none(name, &extras))?;
+        let mut n_files = 0;
+        for first in 0..=u8::MAX {
+            let folder = self.dir.join("objects").join(hex::encode([first]));
+            let removed = files::remove_files(&folder, |name| is_of_none(name, &objects))?;
+            (n_files, len_bytes) = (n_files + removed.0, len_bytes + removed.1);
         }
-        for folder in fs_err::read_dir(self.dir.join("objects"))? {
-            for (path, len_bytes) in files_in(&folder?.path())? {
-                if !named_in(&path, &objects) {
-                    fs_err::remove_file(&path)?;
-                    pruned.n_files += 1;
-                    pruned.len_bytes += len_bytes;
-                }
-            }
-        }
-        Ok(pruned)
+        Ok(Pruned { n_files, len_bytes })
     }
 
     /// Updates metadata and catalogue to the manifests, which a crash may have left ahead of them.
@@ -286,16 +292,35 @@ impl Store {
     }
 }
 
-fn named_in(path: &Path, names: &BTreeSet<Hash32>) -> bool {
-    let name = path.file_name().and_then(|name| name.to_str()).and_then(|name| name.parse().ok());
-    name.is_some_and(|hash: Hash32| names.contains(&hash))
-}
+/// Names in a store's folder, and of what a new disk has.
+const NAMES: [&str; 13] = [
+    "objects",
+    "metadata",
+    "extras",
+    "keys",
+    "tmp",
+    "db",
+    "db.damaged",
+    "job",
+    "drawn",
+    "models.json",
+    files::MANIFEST,
+    files::MANIFEST_PREVIOUS,
+    "lost+found",
+];
 
-fn files_in(folder: &Path) -> io::Result<BTreeMap<PathBuf, u64>> {
-    fs_err::read_dir(folder)?
-        .map(|entry| {
-            let entry = entry?;
-            Ok((entry.path(), entry.metadata()?.len()))
-        })
-        .collect()
+/// Refuses a folder with files that are none of a store's. A store, published or only begun, may have others besides.
+pub(crate) fn check_folder(dir: &Path) -> Result<(), StoreError> {
+    let entries = match fs_err::read_dir(dir) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
+        entries => entries?,
+    };
+    let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
+    let names = names.collect::<io::Result<BTreeSet<String>>>()?;
+    let is_store = names.contains("objects") && (names.contains("extras") || names.contains("db"));
+    let mut others = names.iter().filter(|name| !NAMES.contains(&name.as_str()));
+    match others.next() {
+        Some(found) if !is_store => Err(StoreError::NotAStore { path: dir.to_owned(), found: found.clone() }),
+        _ => Ok(()),
+    }
 }
