@@ -8,9 +8,9 @@ use slag_common::splat::{self, ReadOptions};
 use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
 use slag_encoder::ingest::drawn_from;
 use slag_encoder::progress::Silent;
-use slag_encoder::raster::CpuRasterizer;
+use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 use slag_encoder::viewpoints::{
-    POSES_FILE, SceneKind, ViewpointError, ViewpointPlan, ViewpointSettings, plan,
+    POSES_FILE, SceneKind, ViewpointError, ViewpointPlan, ViewpointSettings, draw, plan,
 };
 use slag_lab::generate::{Scene, grammar};
 use slag_math::random::Random;
@@ -204,8 +204,20 @@ fn a_splat_alone_is_encoded() {
     settings.run.keep_views = true;
     let (models, session) = (ModelDir::colours(), SessionOptions::new("".into()));
     let engines = Engines::new(&models, &session, &CpuRasterizer);
-    let encode =
-        |settings: &EncodeSettings| encode::encode(settings, &engines, &Silent, &false.into()).unwrap();
+    let encoded = |settings: &EncodeSettings| encode::encode(settings, &engines, &Silent, &false.into());
+    let encode = |settings: &EncodeSettings| encoded(settings).unwrap();
+    // Poses and photos of others are not replaced.
+    fs_err::create_dir_all(poses.with_file_name("images")).unwrap();
+    let others = ["images/a.jpg", POSES_FILE].map(|name| poses.with_file_name(name));
+    for path in &others {
+        fs_err::write(path, "{}").unwrap();
+        let refused = encoded(&settings).unwrap_err().to_string();
+        assert!(refused.contains("was not drawn by slag-encoder"), "{refused}");
+        let loaded = CpuRasterizer.load(&room.gaussians).unwrap();
+        let drawn = draw(&poses.with_file_name(""), &mut [], loaded.as_ref(), "scene.ply", false, &Silent);
+        assert!(drawn.unwrap_err().to_string().contains("was not drawn by slag-encoder"));
+        fs_err::remove_file(path).unwrap();
+    }
     let first = encode(&settings);
     assert_eq!((first.n_views, first.n_views_drawn, first.n_views_resumed), (6, 6, 0));
     assert!(first.n_masks > 6 && first.n_without_evidence < first.n_gaussians / 2, "{first:?}");

@@ -9,6 +9,7 @@ use slag_common::{Gaussians, Hash32};
 use super::context::{Engines, RunContext};
 use super::error::EncodeError;
 use super::settings::EncodeSettings;
+use crate::store::remove_files;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
 
 /// Version of plan and drawings; a change redraws them.
@@ -31,6 +32,7 @@ pub(super) fn make(
     if is_there(&inputs.views, id) {
         return Ok(());
     }
+    viewpoints::check_folder(folder)?;
     let make = || {
         let memory_bytes = settings.run.memory_bytes;
         viewpoints::plan(&scene, engines.rasterizer, planned, memory_bytes, context.cancel)
@@ -41,10 +43,8 @@ pub(super) fn make(
         other => other.into(),
     })?;
     tracing::info!("no photos: {plan}");
-    if folder.exists() {
-        // Drawings of another plan.
-        fs_err::remove_dir_all(folder)?;
-    }
+    // Drawings of another plan.
+    remove_files(&folder.join("images"), |name| name.starts_with("drawn-"))?;
     let name = inputs.scene.file_name().unwrap_or_default().to_string_lossy();
     let (views, about) = (viewpoints::views_of(&plan), json!({ "plan": id.to_string() }));
     let (rasterizer, progress) = (engines.rasterizer, context.progress);

@@ -14,6 +14,7 @@ use slag_common::{Gaussians, Intrinsics, durable, npy};
 
 use super::looks::pinhole;
 use super::plan::{Viewpoint, ViewpointPlan};
+use crate::ingest;
 use crate::progress::Progress;
 use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer};
 
@@ -35,6 +36,8 @@ pub enum DrawError {
     Io(#[from] io::Error),
     #[error("a drawing as PNG: {0}")]
     Image(#[from] ImageError),
+    #[error("{}: this was not drawn by slag-encoder, so it is not replaced; name another folder, or move it away", path.display())]
+    Foreign { path: PathBuf },
     #[error("{}: {fault}", path.display())]
     Drawn { path: PathBuf, fault: PhotoError },
 }
@@ -60,6 +63,20 @@ pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
     plan.views.iter().enumerate().map(view).collect()
 }
 
+/// Refuses a folder with poses or images that were not drawn, as the poses file says.
+pub(crate) fn check_folder(folder: &Path) -> Result<(), DrawError> {
+    let poses = folder.join(POSES_FILE);
+    if ingest::drawn_from(&poses).is_some() {
+        return Ok(());
+    }
+    let has_files = |path: &PathBuf| fs_err::read_dir(path).is_ok_and(|mut found| found.next().is_some());
+    let images = ["images", "depth", "coverage"].map(|name| folder.join(name)).into_iter().find(has_files);
+    match images.or_else(|| poses.exists().then_some(poses)) {
+        Some(path) => Err(DrawError::Foreign { path }),
+        None => Ok(()),
+    }
+}
+
 /// Draws views into `images/` of a folder, `with_depth` also into the files of [`Measured`], then writes the poses
 /// file. `drawn_from`: the splat, as the poses file names it.
 pub fn draw(
@@ -70,6 +87,7 @@ pub fn draw(
     with_depth: bool,
     progress: &dyn Progress,
 ) -> Result<(), DrawError> {
+    begin(folder, drawn_from)?;
     draw_images(folder, views, scene, progress, |view, drawing, _| {
         if with_depth {
             Measured::of(view).write(folder, &drawing)?;
@@ -126,6 +144,7 @@ pub fn draw_sharpened(
     about: Value,
     progress: &dyn Progress,
 ) -> Result<(), DrawError> {
+    begin(folder, drawn_from)?;
     let scales = scene.scales.clone();
     scene.scales.iter_mut().flatten().for_each(|scale| *scale *= SQRT_2);
     let blurred = rasterizer.load(scene)?;
@@ -137,6 +156,13 @@ pub fn draw_sharpened(
         Ok(sharpened(&drawing.image(), &read(path)?))
     })?;
     write_poses(folder, views, drawn_from, about)
+}
+
+/// Marks a folder as ours, without views, so that drawing can begin anew after an interruption.
+fn begin(folder: &Path, drawn_from: &str) -> Result<(), DrawError> {
+    check_folder(folder)?;
+    fs_err::create_dir_all(folder)?;
+    write_poses(folder, &[], drawn_from, json!({}))
 }
 
 fn read(path: &Path) -> Result<RgbImage, DrawError> {

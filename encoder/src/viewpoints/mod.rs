@@ -20,6 +20,7 @@ use crate::raster::{RasterError, Rasterizer};
 use looks::Look;
 use space::Space;
 
+pub(crate) use draw::check_folder;
 pub(crate) use draw::{DrawError, DrawnView, views_of};
 pub use draw::{POSES_FILE, draw, draw_sharpened};
 pub(crate) use plan::{Fault, Viewpoint};
