@@ -22,6 +22,7 @@ use slag_models::{ModelDir, SessionOptions, TextEncoder};
 use slag_service::stop::{on_stop, stop_signal};
 use tracing_subscriber::EnvFilter;
 
+use super::outputs::folder_of;
 use crate::ingest::{Activated, FrameChoice};
 use crate::store::StoreReader;
 use crate::store::metadata::{MetadataReader, clock_unix_secs};
@@ -127,6 +128,22 @@ pub struct InputArgs {
     /// Treats a missing or unreadable photo or mask as an error instead of leaving the view out.
     #[arg(long, help_heading = "Inputs")]
     pub strict: bool,
+}
+
+impl InputArgs {
+    /// Files and folders that are read; photos lie in the folder of their poses.
+    pub(super) fn paths_read(&self) -> Vec<&Path> {
+        let frame = match &self.splat_frame {
+            FrameChoice::File(path) => Some(path.as_path()),
+            FrameChoice::Auto | FrameChoice::None => None,
+        };
+        let views = self.views.as_deref();
+        let folder = views.map(folder_of).filter(|_| self.images.is_none());
+        [Some(self.scene.as_path()), views, folder, self.images.as_deref(), frame]
+            .into_iter()
+            .flatten()
+            .collect()
+    }
 }
 
 fn parse_activated(text: &str) -> Result<Activated, String> {

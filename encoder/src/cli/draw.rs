@@ -12,6 +12,7 @@ use slag_common::{Gaussians, View, poses};
 
 use super::common::{Exit, print};
 use super::memory::default_memory_bytes;
+use super::outputs::{self, folder_of};
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -84,7 +85,12 @@ fn parse_up(text: &str) -> Result<DVec3, String> {
 }
 
 impl DrawingArgs {
-    fn open(&self) -> Result<(Gaussians, Devices, String)> {
+    /// `views`: poses to draw at.
+    fn open(&self, views: Option<&Path>) -> Result<(Gaussians, Devices, String)> {
+        let read = [Some(self.scene.as_path()), views].into_iter().flatten();
+        let read: Vec<&Path> = read.flat_map(|path| [path, folder_of(path)]).collect();
+        outputs::check([self.out.as_path()], &read, None)?;
+        viewpoints::check_folder(&self.out)?;
         let scene = splat::read(&self.scene, &ReadOptions { with_sh_rest: true })?;
         let name = self.scene.file_name().unwrap_or_default().to_string_lossy().into_owned();
         Ok((scene, Devices::open(&self.device, GpuOptions::default())?, name))
@@ -92,7 +98,7 @@ impl DrawingArgs {
 }
 
 pub(super) fn plan(args: &PlanArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let (mut scene, devices, name) = args.drawing.open()?;
+    let (mut scene, devices, name) = args.drawing.open(None)?;
     let settings = ViewpointSettings { n_views: args.views_limit as usize, up: args.up.up };
     let plan = viewpoints::plan(&scene, &devices, &settings, default_memory_bytes(), &false.into())?;
     let views = viewpoints::views_of(&plan);
@@ -104,7 +110,7 @@ pub(super) fn plan(args: &PlanArgs, progress: &dyn Progress, json: bool) -> Resu
 }
 
 pub(super) fn draw(args: &DrawArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let (scene, devices, name) = args.drawing.open()?;
+    let (scene, devices, name) = args.drawing.open(Some(&args.views))?;
     let set = poses::read(&args.views, None)?;
     set.notes.iter().chain(&set.left_out()).for_each(|note| tracing::warn!("{note}"));
     let mut views: Vec<DrawnView> = set.views.iter().map(drawn_view).collect();

@@ -20,6 +20,7 @@ use super::common::{
 use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
 use super::next;
+use super::outputs;
 use super::summary::lines;
 use crate::cells::PositionError;
 use crate::encode::front::{Expectation, Front, Target};
@@ -168,6 +169,14 @@ pub struct EncodeArgs {
     restart: bool,
 }
 
+impl EncodeArgs {
+    fn paths_read(&self) -> Vec<&Path> {
+        let masks = Path::new(&self.masks);
+        let files = self.added.iter().chain(&self.geo).chain(&self.target.front).map(PathBuf::as_path);
+        self.input.paths_read().into_iter().chain([masks]).chain(files).collect()
+    }
+}
+
 /// Refuses names that cannot stand in logs and headers.
 fn parse_name(text: &str) -> Result<String, String> {
     match (1..=200).contains(&text.len()) && !text.contains(char::is_control) {
@@ -308,6 +317,7 @@ fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expe
 }
 
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    outputs::check(args.report.as_deref(), &args.paths_read(), Some(&args.store))?;
     args.report.iter().try_for_each(|path| files::check_writable(path))?;
     let (mut settings, expected) = settings_and_target(args)?;
     let (models, session) = open_models(&args.models)?;
