@@ -108,3 +108,18 @@ fn a_missing_key_is_told_before_the_work() {
     assert!(message.contains("snapshot.key: it is missing") && message.contains("keys rotate"), "{message}");
     assert_eq!(*seen.lock().unwrap(), [""; 0]);
 }
+
+/// A camera above the scene that looks up is no use, and the summary says so.
+#[test]
+fn views_that_see_nothing_are_left_out() {
+    let room = Room::new();
+    let poses = &room.settings.inputs.views;
+    let mut json: serde_json::Value = serde_json::from_slice(&fs_err::read(poses).unwrap()).unwrap();
+    json["frames"][1]["transform_matrix"] =
+        serde_json::json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1e6], [0, 0, 0, 1]]);
+    fs_err::write(poses, json.to_string()).unwrap();
+    let summary = room.encode(|_| {}).unwrap();
+    let skipped = summary.skipped_views;
+    assert_eq!((summary.n_views, skipped.len()), (3, 1), "{skipped:?}");
+    assert!(skipped[0].reason.contains("sees no Gaussian"), "{skipped:?}");
+}

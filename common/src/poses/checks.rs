@@ -8,6 +8,9 @@ use crate::camera::{Distortion, Intrinsics};
 /// Largest image side accepted, pixels: that of the largest JPEG; pixel indices fit 32 bits.
 const MAX_SIDE_PX: u32 = 65_535;
 
+/// Largest translation accepted: beyond, a 64-bit coordinate is coarser than a ten-thousandth of a unit.
+const MAX_TRANSLATION: f64 = 1e12;
+
 /// Largest deviation from unit length or orthonormality that counts as rounding; printouts with 3 decimals are below.
 const ROTATION_TOLERANCE: f64 = 5e-3;
 
@@ -111,8 +114,11 @@ pub(super) fn affine_from_rows(image: &str, rows: &[Vec<f64>], axes: DMat3) -> R
 
 fn check_translation(translation: [f64; 3]) -> Result<DVec3, PoseProblem> {
     let vector = DVec3::from_array(translation);
-    if vector.is_finite() {
-        return Ok(vector);
+    match translation.iter().find(|value| value.is_nan() || value.abs() > MAX_TRANSLATION) {
+        None => Ok(vector),
+        Some(value) => {
+            let expected = "a translation of at most 1e12 along each axis";
+            Err(PoseProblem::Expected { expected, found: format!("{value:e}") })
+        }
     }
-    Err(PoseProblem::Expected { expected: "a finite translation", found: format!("{translation:?}") })
 }

@@ -16,7 +16,7 @@ use super::context::RunContext;
 use super::error::EncodeError;
 use super::executor::Executor;
 use super::plan::Plan;
-use super::report::{CellReport, EncodeSummary};
+use super::report::{CellReport, EncodeSummary, LeftOut};
 use super::settings::Masks;
 use super::views::DoneViews;
 use crate::store::{ModelsRecord, Store};
@@ -50,6 +50,7 @@ pub(super) fn publish(
     executor.begin_publication()?;
     plan.store.publish(&manifest, &built.extras)?;
     let mut summary = summary(&plan, &views, built, &manifest);
+    leave_out_blind(&mut summary);
     // With views left to do, contributions stay for the next encode.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
     let store = plan.store;
@@ -179,6 +180,21 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         images_on: views.images_on.clone(),
         encoder: plan.engines.models.encoder_id().to_string(),
     }
+}
+
+/// Counts views as left out that have masks but see no Gaussian.
+fn leave_out_blind(summary: &mut EncodeSummary) {
+    let views = &summary.views;
+    let seen = views.view.iter().zip(&views.n_masks).zip(&views.n_entries);
+    let blind = seen.filter(|((_, n_masks), n_entries)| **n_masks > 0 && **n_entries == 0);
+    let mut left_out = LeftOut::default();
+    for ((view, _), _) in blind {
+        let reason = "it sees no Gaussian of the splat; correct its pose, or leave it out with --drop".into();
+        left_out.push(view.clone(), reason);
+    }
+    let blind = left_out.end();
+    summary.n_views -= blind.len();
+    summary.skipped_views.extend(blind);
 }
 
 fn cell_report(record: &CellRecord, built: &BuiltCells) -> CellReport {
