@@ -562,3 +562,22 @@ fn masks_are_matched_with_their_photos() {
     let said = check(dir.path(), true).unwrap().unwrap();
     assert!(said.contains("b.png is read") && said.ends_with("b.json beside it is not"), "{said}");
 }
+
+/// A file of masks that two photos share is refused, until each has its own.
+#[test]
+fn masks_belong_to_one_photo() {
+    let dir = tempfile::tempdir().unwrap();
+    let views = [view("a.jpg", 4, 3), view("a.png", 4, 3)];
+    let check = || {
+        let given = GivenMasks::open(dir.path(), Vec::new()).unwrap();
+        given.check_views(&views, true).map_err(|error| error.to_string())
+    };
+    fs_err::write(dir.path().join("a.json"), "[]").unwrap();
+    let error = check().unwrap_err();
+    assert!(error.contains(r#""a.jpg" or of "a.png""#) && error.contains("a.jpg.png"), "{error}");
+    fs_err::remove_file(dir.path().join("a.json")).unwrap();
+    for view in &views {
+        fs_err::write(dir.path().join(format!("{}.json", view.name)), "[]").unwrap();
+    }
+    check().unwrap();
+}

@@ -138,6 +138,12 @@ pub enum SegmentError {
     },
     #[error("{}: {what}; correct it, or export the data set again", path.display())]
     DataSet { path: PathBuf, what: String },
+    #[error(
+        "{}: it may have the masks of {first:?} or of {second:?}; name each file of masks after all of its photo's name, such \
+         as {first}.png",
+        path.display()
+    )]
+    TwoPhotos { path: PathBuf, first: String, second: String },
     #[error("{}: mask {index}: {source}", path.display())]
     Rle {
         path: PathBuf,

@@ -77,9 +77,12 @@ impl GivenMasks {
         }
     }
 
-    /// Refuses a data set's entry that matches several views: it is ambiguous.
+    /// Refuses a file, or an entry of a data set, that matches several views: it is ambiguous.
     fn check_entries(&self, views: &[View]) -> Result<(), SegmentError> {
-        let Source::DataSet { path, masks_of_image } = &self.source else { return Ok(()) };
+        let (path, masks_of_image) = match &self.source {
+            Source::Folder(dir) => return check_files(dir, views),
+            Source::DataSet { path, masks_of_image } => (path, masks_of_image),
+        };
         let mut view_of_entry: BTreeMap<&str, &str> = BTreeMap::new();
         for view in views {
             let Some((entry, _)) = coco::entry(masks_of_image, &view.name) else { continue };
@@ -214,6 +217,18 @@ impl Segmenter for GivenMasks {
 pub fn file_of(dir: &Path, view: &View) -> Option<PathBuf> {
     let folder = || Some(dir.join(&view.name).with_extension("")).filter(|of| of.join("0.png").is_file());
     files_of(dir, view).next().or_else(folder)
+}
+
+fn check_files(dir: &Path, views: &[View]) -> Result<(), SegmentError> {
+    let mut view_of_file: BTreeMap<PathBuf, &str> = BTreeMap::new();
+    for view in views {
+        let Some(path) = file_of(dir, view) else { continue };
+        if let Some(first) = view_of_file.insert(path.clone(), &view.name) {
+            let (first, second) = (first.to_owned(), view.name.clone());
+            return Err(SegmentError::TwoPhotos { path, first, second });
+        }
+    }
+    Ok(())
 }
 
 fn files_of(dir: &Path, view: &View) -> impl Iterator<Item = PathBuf> + use<> {
