@@ -179,7 +179,7 @@ fn sizes_that_are_a_scale_bring_the_camera_along() {
     }
     assert!(load(80, 60, "png", odd).is_ok(), "halved and rounded down");
     assert!(load(81, 61, "png", odd).is_ok(), "halved and rounded up");
-    for (width, height) in [(160, 121), (159, 120), (120, 160), (81, 60), (80, 59)] {
+    for (width, height) in [(160, 121), (159, 120), (120, 160), (81, 60), (80, 59), (1440, 1080)] {
         match load(width, height, "png", camera(Distortion::None)) {
             Err(IngestError::Size { found_px, expected_px, .. }) => {
                 assert_eq!((found_px, expected_px), ([width, height], [160, 120]));

@@ -2,7 +2,8 @@
 
 mod jpeg;
 
-use std::io::{self, BufRead, Seek, SeekFrom};
+use std::io::{self, BufRead, BufReader, Seek, SeekFrom};
+use std::path::Path;
 
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, RgbImage};
 
@@ -60,6 +61,11 @@ pub fn head<'a>(input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDecoder 
     limits.max_alloc = Some(HEAD_BYTES);
     reader.limits(limits);
     Ok(Box::new(reader.into_decoder()?))
+}
+
+/// Width and height of a photo by its header, whatever its name ends in; `None` if it cannot be read.
+pub fn size_px(path: &Path) -> Option<(u32, u32)> {
+    Some(head(BufReader::new(files::open(path).ok()?)).ok()?.dimensions())
 }
 
 /// Opens a photo as [`head`] does; refuses other files, and damage that decoders would fill with grey or noise.

@@ -83,6 +83,12 @@ pub enum PoseProblem {
         "image {image:?}: {field} is missing, both in the frame and at the top of the file; add it to one of them"
     )]
     MissingIntrinsics { image: String, field: &'static str },
+    #[error(
+        "image {image:?}: its size is unknown: neither the frame nor the top of the file has w and h, and {} cannot be read; \
+         add them, or give the photos' folder with --images",
+        photo.display()
+    )]
+    NoSize { image: String, photo: PathBuf },
     #[error("two images have the name {image:?}; remove or rename one of them")]
     DuplicateImage { image: String },
     #[error("two cameras have the id {camera_id}; remove one of them")]
@@ -119,6 +125,9 @@ impl PoseProblem {
             Self::NotARotation { deviation, .. } => format!("its rotation is off by {deviation:.3e}"),
             Self::Mirrored { .. } => "its matrix mirrors".to_owned(),
             Self::Expected { expected, found } => format!("expected {expected}, found {found:?}"),
+            Self::NoSize { photo, .. } => {
+                format!("the file does not state its size, and the photo {} cannot be read", photo.display())
+            }
             other => other.to_string(),
         }
     }

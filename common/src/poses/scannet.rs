@@ -19,7 +19,7 @@ use super::error::{Place, PoseError, PoseProblem};
 use super::transforms::existing;
 use super::view_set::{Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
-use crate::files;
+use crate::{files, photo};
 
 pub(super) const POSES: &str = "pose";
 const PHOTOS: &str = "color";
@@ -85,7 +85,7 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
         return view_set(&dir.join(POSES), Vec::new(), PoseSource::Scannet, damaged);
     }
     // All photos have the size of the first readable one.
-    let Some(size_px) = posed.iter().find_map(|(_, path, _)| image::image_dimensions(path).ok()) else {
+    let Some(size_px) = posed.iter().find_map(|(_, path, _)| photo::size_px(path)) else {
         let problem = PoseProblem::NoImageSize { n_poses: posed.len(), folder: photos };
         return Err(problem.at(&intrinsics_path, Place::File));
     };

@@ -15,7 +15,7 @@ use super::error::{Place, PoseError, PoseProblem};
 use super::paths::{PhotoFinder, Stated, parent, parts_of, take_back_shared};
 use super::view_set::{AppliedTransform, Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
-use crate::files;
+use crate::{files, photo};
 
 /// Largest ratio between a stated focal length and that of a stated angle, if they agree.
 const MAX_FOCAL_RATIO: f64 = 1.02;
@@ -101,7 +101,14 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
         let photo = photo.ok_or_else(|| PoseProblem::UnsafeName { image }.at(path, place))?;
         let FramePhoto { name, image_path, elsewhere } = photo;
         let camera = frame.camera.clone().or(&transforms.camera);
-        let intrinsics = camera.intrinsics(&name, &image_path).map_err(|problem| problem.at(path, place))?;
+        let intrinsics = match camera.intrinsics(&name, &image_path) {
+            Ok(intrinsics) => intrinsics,
+            Err(problem @ PoseProblem::NoSize { .. }) => {
+                damaged.add(&name, problem, path, place);
+                continue;
+            }
+            Err(problem) => return Err(problem.at(path, place)),
+        };
         views.push(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() });
         stated.push(elsewhere);
     }
@@ -308,9 +315,9 @@ impl Camera {
         let [width_px, height_px] = match (self.w, self.h) {
             (Some(w), Some(h)) => [w, h],
             // NeRF's first data sets state the size only in the images.
-            _ => image::image_dimensions(image_path)
-                .map(|(w, h)| [f64::from(w), f64::from(h)])
-                .map_err(|_| PoseProblem::MissingIntrinsics { image: image.to_owned(), field: "w and h" })?,
+            _ => photo::size_px(image_path).map(|(w, h)| [f64::from(w), f64::from(h)]).ok_or_else(|| {
+                PoseProblem::NoSize { image: image.to_owned(), photo: image_path.to_owned() }
+            })?,
         };
         let focal = |length: Option<f64>, angle: Option<f64>, side_px: f64| {
             length.or_else(|| angle.filter(|a| *a > 0.0 && *a < PI).map(|a| 0.5 * side_px / (0.5 * a).tan()))

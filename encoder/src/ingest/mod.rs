@@ -21,6 +21,8 @@ pub use undistort::Undistorter;
 
 /// Largest factor by which photos may be downscaled from the size in the intrinsics.
 const MAX_DOWNSCALE: u32 = 64;
+/// Largest factor by which they may be enlarged: more is a damaged header.
+const MAX_UPSCALE: u64 = 8;
 /// Peak bytes per pixel while a photo is loaded: eight as read (16 bits, transparent), three as colours; three without
 /// distortion, which replace the first.
 pub(crate) const LOADED_BYTES_PER_PX: u64 = 11;
@@ -100,7 +102,7 @@ pub enum IngestError {
     )]
     TooLarge { path: PathBuf, size_px: [u32; 2], needed: ByteSize, free: ByteSize },
     #[error(
-        "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other; \
+        "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other, 1/{MAX_DOWNSCALE} to {MAX_UPSCALE}; \
          give the images that the poses were computed from, or whole-factor reductions of them",
         path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1]
     )]
@@ -139,12 +141,8 @@ pub(crate) fn photo_area_px(view: &View) -> u64 {
 
 /// Size of a view's photo by its header; the camera's if the header cannot be read.
 fn photo_size_px(view: &View) -> [u32; 2] {
-    let of_header = || {
-        let input = BufReader::new(files::open(&view.image_path).ok()?);
-        Some(photo::head(input).ok()?.dimensions())
-    };
     let of_camera = (view.intrinsics.width_px, view.intrinsics.height_px);
-    let (width_px, height_px) = of_header()
+    let (width_px, height_px) = photo::size_px(&view.image_path)
         .filter(|(width_px, height_px)| is_scale_of(&view.intrinsics, *width_px, *height_px))
         .unwrap_or(of_camera);
     [width_px, height_px]
@@ -222,7 +220,7 @@ fn swaps_sides(orientation: Orientation) -> bool {
     matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// Whether a size is exactly proportional to the camera's, or that divided by an integer with each side rounded up or
+/// Whether a size is exactly proportional to the camera's, up to [`MAX_UPSCALE`] of it, or that divided by an integer with each side rounded up or
 /// down, as in downscaled copies.
 fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
     let proportional = u64::from(width_px) * u64::from(camera.height_px)
@@ -230,6 +228,7 @@ fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
     let reduced = |side_px: u32, of_px: u32, n: u32| side_px == of_px / n || side_px == of_px.div_ceil(n);
     width_px > 0
         && height_px > 0
+        && u64::from(width_px) <= MAX_UPSCALE * u64::from(camera.width_px)
         && (proportional
             || (2..=MAX_DOWNSCALE)
                 .any(|n| reduced(width_px, camera.width_px, n) && reduced(height_px, camera.height_px, n)))
