@@ -96,14 +96,20 @@ fn plain_colours_stand_in_for_harmonics() {
     let header = "ply\nformat ascii 1.0\nelement vertex 1\n";
     let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2";
     let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
-    let colours = "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n";
-    let text = format!("{header}{floats}{colours}1 2 3 0 2 0 0 0 0 0 0 255 0 51\n");
+    let colours = |kind: &str| {
+        ["red", "green", "blue"].map(|c| format!("property {kind} {c}\n")).concat() + "end_header\n"
+    };
     let folder = tempfile::tempdir().expect("a folder");
-    let found = read_bytes(folder.path(), "rgb.ply", text.as_bytes()).unwrap_or_else(|e| panic!("{e}"));
-    for (found, expected) in found.rgb_dc(0).into_iter().zip([1.0, 0.0, 0.2]) {
-        assert_near(found.into(), expected, 1e-6, "colour");
+    for (kind, values) in
+        [("uchar", "255 0 51"), ("ushort", "65535 0 13107"), ("float", "1 0 0.2"), ("float", "255 0 51")]
+    {
+        let text = format!("{header}{floats}{}1 2 3 0 2 0 0 0 0 0 0 {values}\n", colours(kind));
+        let found = read_bytes(folder.path(), "rgb.ply", text.as_bytes()).unwrap_or_else(|e| panic!("{e}"));
+        for (found, expected) in found.rgb_dc(0).into_iter().zip([1.0, 0.0, 0.2]) {
+            assert_near(found.into(), expected, 1e-6, kind);
+        }
+        assert_eq!((found.opacities[0], found.rotations_wxyz[0]), (0.5, [1.0, 0.0, 0.0, 0.0]));
     }
-    assert_eq!((found.opacities[0], found.rotations_wxyz[0]), (0.5, [1.0, 0.0, 0.0, 0.0]));
 }
 
 #[test]

@@ -101,8 +101,13 @@ impl Element {
         self.properties.iter().position(|p| p.name == name)
     }
 
-    pub fn is_float(&self, index: usize) -> bool {
-        matches!(self.properties[index].kind, Kind::Scalar(Scalar::F32 | Scalar::F64))
+    /// Returns the largest value of an unsigned integer; `None` of other types.
+    pub fn largest(&self, index: usize) -> Option<f64> {
+        match self.properties[index].kind {
+            Kind::Scalar(Scalar::U8) => Some(f64::from(u8::MAX)),
+            Kind::Scalar(Scalar::U16) => Some(f64::from(u16::MAX)),
+            _ => None,
+        }
     }
 
     /// Returns the length of a binary row, or `None` if the element has lists.

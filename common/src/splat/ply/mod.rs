@@ -29,6 +29,8 @@ const NOT_A_SPLAT: &str =
     "this is not a trained splat but perhaps a point cloud or mesh: give the PLY of the splat";
 const VERTEX: &str = "vertex";
 const GEOMETRY: [&str; 9] = ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0"];
+/// Colours of 0 to 1 are not brighter, even where harmonics overshoot.
+const BRIGHTEST: f32 = 16.0;
 /// Balls lack the second and third scale.
 const SECOND_SCALE: &str = "scale_1";
 /// Flat Gaussians of 2DGS lack the third.
@@ -58,14 +60,11 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
     }
     let rgb_names = ["red", "green", "blue"];
     let rgb: Option<Vec<usize>> = rgb_names.iter().map(|name| ply.elements[vertex].property(name)).collect();
-    // nerfstudio exports plain colours on request ("rgb"), others write numbers of 0 to 1.
-    let white = match (&rgb, ply.elements[vertex].property("f_dc_0")) {
-        (Some(rgb), None) => Some(if ply.elements[vertex].is_float(rgb[0]) { 1.0 } else { 255.0 }),
-        _ => None,
-    };
-    match (rgb, white) {
-        (Some(rgb), Some(_)) => wanted.extend(rgb),
-        _ => wanted.extend(ply.properties(vertex, &["f_dc_0", "f_dc_1", "f_dc_2"], NOT_A_SPLAT)?),
+    // nerfstudio exports plain colours on request ("rgb").
+    let colours = rgb.filter(|_| ply.elements[vertex].property("f_dc_0").is_none());
+    match &colours {
+        Some(rgb) => wanted.extend(rgb),
+        None => wanted.extend(ply.properties(vertex, &["f_dc_0", "f_dc_1", "f_dc_2"], NOT_A_SPLAT)?),
     }
     let (degree, rest) = sh_rest_properties(&ply, vertex)?;
     let degree = options.kept_degree(degree);
@@ -84,11 +83,21 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
         let [s0, s1, s2] = [s0, s1, s2].map(|s| s.exp() as f32);
         out.scales.push([s0, s1, if is_ball || third_scale.is_some() { s2 } else { 0.0 }]);
         out.opacities.push(sigmoid(*logit));
-        out.sh_dc.push([r, g, b].map(|c| white.map_or(*c as f32, |white| dc_of_colour(c / white))));
+        out.sh_dc.push([r, g, b].map(|c| *c as f32));
         out.sh_rest.extend(rest.iter().map(|c| *c as f32));
     })?;
+    let largest = colours.as_ref().and_then(|rgb| ply.elements[vertex].largest(rgb[0]));
     ply.finish()?;
+    if colours.is_some() {
+        let white = largest.unwrap_or_else(|| white_of(out.sh_dc.iter().flatten()));
+        out.sh_dc.iter_mut().flatten().for_each(|c| *c = dc_of_colour(f64::from(*c) / white));
+    }
     Ok(out)
+}
+
+/// White among colours of other types than unsigned integers: most programs write 0 to 1, some 0 to 255.
+fn white_of<'a>(colours: impl Iterator<Item = &'a f32>) -> f64 {
+    if colours.fold(0.0f32, |most, c| most.max(*c)) > BRIGHTEST { 255.0 } else { 1.0 }
 }
 
 /// Reads properties of a mesh or point cloud: a row per vertex, in the order of `names`.
