@@ -51,7 +51,10 @@ fn the_client_of_the_mcp_project_asks_a_robot() {
 #[test]
 fn cyclone_dds_asks_a_robot() {
     let python = python_with("doors/ros/tests");
-    let site = Site::new();
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let geo = dir.path().join("geo.json");
+    fs_err::write(&geo, r#"{"origin": {"lat": 47.25, "lon": 8.5, "alt": 400}}"#).expect("writes");
+    let site = Site::of(&ROOM, &[&SITE[..], &["--geo", text(&geo)]].concat());
     let robot = site.robot(&["--follow", &site.store.url]);
     // Separates concurrent runs of the tests.
     let domain = (50 + std::process::id() % 40).to_string();

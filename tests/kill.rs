@@ -66,7 +66,9 @@ fn a_hangup_that_is_ignored_stops_nothing() {
             assert!(child.try_wait().expect("waits").is_none(), "it ended before a view");
             std::thread::sleep(Duration::from_millis(1));
         }
-        refused(&mut encode_quickly(&generated(&ROOM), &store), "another slag-encoder");
+        if !trap.is_empty() {
+            refused(&mut encode_quickly(&generated(&ROOM), &store), "another slag-encoder");
+        }
         let kill = Command::new("kill").args(["-HUP", &child.id().to_string()]).status();
         assert!(kill.expect("runs").success());
         assert_eq!(child.wait().expect("waits").code(), Some(expected));

@@ -138,16 +138,18 @@ fn odd_views_are_counted_not_fatal() {
     let output = encode("--restart").output().expect("starts");
     assert_eq!(output.status.code(), Some(3), "done with some inputs left out");
     let summary: Value = serde_json::from_slice(&output.stdout).expect("a summary");
-    for (name, expected) in [("n_views", 3), ("n_views_without_masks", 1), ("n_masks", 3)] {
+    for (name, expected) in [("n_views", 2), ("n_views_without_masks", 1), ("n_masks", 3)] {
         assert_eq!(summary[name], expected, "{name}");
     }
     let skipped = summary["skipped_views"].as_array().expect("a list");
     let skipped: Vec<&Value> = skipped.iter().map(|skipped| &skipped["view"]).collect();
-    assert_eq!(skipped, ["0002.png", "0003.png", "0005.png", "0006.png", "0007.png"]);
+    assert_eq!(skipped, ["0002.png", "0003.png", "0005.png", "0006.png", "0007.png", "0004.png"]);
     assert!(summary["n_without_evidence"].as_u64() < summary["n_gaussians"].as_u64());
     assert_eq!(summary["encoder_before"], Value::Null);
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("1 more views are left out") && !said.contains("view 0007.png"), "{said}");
+    // Of four, whichever come first.
+    let n_named = said.matches("unexpected end of file").count();
+    assert!(said.contains("1 more views are left out") && n_named == 3, "{said}");
     // Other models: robots need the new text model, and the summary names the previous encoder.
     let output = encode("--restart").args(["--models", "colours"]).output().expect("starts");
     let (again, said) = (

@@ -85,7 +85,7 @@ fn damaged_scene_folders_are_named() {
     let posed = pose(world_from_camera(7));
     let texts: [(Vec<u8>, &str); 10] = [
         (posed.replace("0.997551", "nan").into(), "its rotation is off by NaN"),
-        (posed.replace("7.000000", "inf").into(), "a finite translation"),
+        (posed.replace("7.000000", "inf").into(), "a translation of at most 1e12"),
         ("0 0 0 0\n".repeat(4).into(), "found \"[0.0, 0.0, 0.0, 0.0]\""),
         ("1 0 0 0\n0 1 0 0\n0 0 one 0\n0 0 0 1\n".into(), "expected a number, found \"one\""),
         ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n".into(), "4 rows of 4 numbers"),

@@ -51,6 +51,8 @@ struct Shared {
     frames: Mutex<Transforms>,
     /// Robot's place in the scene, and time of the last post.
     place: Mutex<(Option<[f64; 3]>, Option<Instant>)>,
+    /// Why the last position was not taken.
+    not_taken: Mutex<Option<String>>,
     detections: Publisher<Detection3DArray>,
     objects: Publisher<Detection3DArray>,
     markers: Publisher<MarkerArray>,
@@ -186,6 +188,7 @@ impl Shared {
             locating,
             frames: Mutex::default(),
             place: Mutex::default(),
+            not_taken: Mutex::default(),
             robot,
             args,
         })
@@ -584,9 +587,15 @@ impl Shared {
     }
 
     async fn post(self: Arc<Self>, place: Value) {
-        let posted = tokio::task::spawn_blocking(move || self.robot.post_position(&place)).await;
-        if let Ok(Err(error)) = posted {
-            tracing::warn!("the position is not taken: {error}");
+        let shared = Arc::clone(&self);
+        let posted = tokio::task::spawn_blocking(move || shared.robot.post_position(&place)).await;
+        let Ok(posted) = posted else { return };
+        // Positions come ten times a second: a reason is told once.
+        let reason = posted.err().map(|error| error.to_string());
+        let before =
+            std::mem::replace(&mut *self.not_taken.lock().expect("no holder panics"), reason.clone());
+        if let Some(reason) = reason.filter(|reason| before.as_ref() != Some(reason)) {
+            tracing::warn!("the position is not taken: {reason}");
         }
     }
 }

@@ -249,7 +249,7 @@ mod tests {
         assert!((worth(&views(11), 16, 1) - 0.9_f64.powi(8) * 2.0).abs() < 1e-6);
         assert_eq!(worth(&views(12), 16, 1), 0.0);
         // Cut a little, two count for one.
-        let half = |at: &mut NodeView| at.uncut = 0.825;
+        let half = |at: &mut NodeView| at.uncut = 0.84;
         let mut nearly: NodeViews = views(11);
         nearly.values_mut().take(2).for_each(half);
         assert!(worth(&nearly, 16, 1) > 0.0);

@@ -147,7 +147,7 @@ fn oracle(
         mask.intersection(&of_view).count() as f64 / mask.union(&of_view).count() as f64
     };
     let worth = |set: &Set| {
-        let (mut agreements, mut n_same) = (Vec::<(f64, f64)>::new(), 0);
+        let (mut agreements, mut n_whole) = (Vec::<(f64, f64)>::new(), 0.0);
         for (view, masks) in masks.iter().enumerate() {
             let n_seen = seen(view, set).len();
             if n_seen == 0 || 10 * n_seen < set.len() {
@@ -156,11 +156,12 @@ fn oracle(
             let ious = masks.iter().map(|(mask, of)| (iou(view, of, set), uncut(view, *mask)));
             let (best, uncut) = ious.fold((0.0, 1.0), |best, of| if of.0 > best.0 { of } else { best });
             agreements.push((best, uncut.max(0.05).powi(2)));
-            n_same += usize::from(best > 0.5 && uncut >= 0.9);
+            n_whole += if best > 0.5 { ((uncut - 0.75) / 0.15).clamp(0.0, 1.0) } else { 0.0 };
         }
         let weights: f64 = agreements.iter().map(|(_, weight)| weight).sum();
         let consensus = agreements.iter().map(|(best, weight)| best * weight).sum::<f64>() / weights;
-        let is_thing = set.len() >= 10 && n_same >= 1 && consensus >= 0.3;
+        let is_thing =
+            set.len() >= 10 && n_whole > 0.0 && 11.0 * n_whole >= agreements.len() as f64 && consensus >= 0.3;
         if is_thing { consensus.powi(8) * (set.len() as f64).powf(0.25) } else { 0.0 }
     };
     let worths: Vec<f64> = sets.iter().map(|set| worth(&gaussians(set))).collect();
