@@ -36,8 +36,9 @@ pub fn read_short(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
+/// Reads a file of poses, masks or settings: none has 4 GiB, but `/dev/zero` has no end.
 pub fn read(path: &Path) -> io::Result<Vec<u8>> {
-    read_short(path, u64::MAX)
+    read_short(path, 1 << 32)
 }
 
 /// The encoding of a text that is not UTF-8.

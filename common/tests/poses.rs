@@ -102,7 +102,8 @@ fn a_given_image_folder_replaces_the_default() {
 fn lens_models() {
     let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
     type Case = (i32, &'static str, &'static [f64], [f64; 4], Distortion);
-    let cases: [Case; 7] = [
+    let fisheye = |k| Distortion::Fisheye { k };
+    let cases: [Case; 9] = [
         (0, "SIMPLE_PINHOLE", &[50.0, 32.0, 24.0], [50.0, 50.0, 32.0, 24.0], Distortion::None),
         (1, "PINHOLE", &[50.0, 51.0, 32.0, 24.0], [50.0, 51.0, 32.0, 24.0], Distortion::None),
         (2, "SIMPLE_RADIAL", &[50.0, 32.0, 24.0, 0.1], [50.0, 50.0, 32.0, 24.0], brown(0.1, 0.0, [0.0; 2])),
@@ -120,7 +121,21 @@ fn lens_models() {
             "OPENCV_FISHEYE",
             &[50.0, 51.0, 32.0, 24.0, 0.1, -0.2, 0.3, 0.4],
             [50.0, 51.0, 32.0, 24.0],
-            Distortion::Fisheye { k: [0.1, -0.2, 0.3, 0.4] },
+            fisheye([0.1, -0.2, 0.3, 0.4]),
+        ),
+        (
+            8,
+            "SIMPLE_RADIAL_FISHEYE",
+            &[50.0, 32.0, 24.0, 0.1],
+            [50.0, 50.0, 32.0, 24.0],
+            fisheye([0.1, 0.0, 0.0, 0.0]),
+        ),
+        (
+            9,
+            "RADIAL_FISHEYE",
+            &[50.0, 32.0, 24.0, 0.1, -0.2],
+            [50.0, 50.0, 32.0, 24.0],
+            fisheye([0.1, -0.2, 0.0, 0.0]),
         ),
     ];
     for (number, model, params, [fx, fy, cx, cy], distortion) in cases {
@@ -171,6 +186,10 @@ fn colmap_errors_have_place_and_fault() {
     assert_eq!(place, Place::Line(2));
     assert_eq!(what, PoseProblem::UnsupportedModel { camera_id: 1, model: "FULL_OPENCV".into() });
     assert!(what.to_string().contains("image_undistorter"));
+    for unused in ["2 FOV 64 48 50 50 32 24 0.1", "2 SPHERE 64 48", "2 PINHOLE 0 0 0 0 0 0", "2"] {
+        let set = read_text(&format!("{unused}\n{CAMERA}"), IMAGE);
+        assert_eq!(set.unwrap().views.len(), 1, "{unused}");
+    }
 
     let (place, what) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 2 a.jpg\n\n"));
     assert_eq!(
@@ -268,6 +287,9 @@ fn frames_without_a_valid_pose_are_left_out() {
         assert!(set.left_out().unwrap().contains("1 of 2 frames have no pose"), "{bad}");
         assert_eq!(problem(read(&[bad.clone(), bad])).0, Place::Frame(0));
     }
+    let mut rounded = frame("a.jpg");
+    rounded["transform_matrix"][3] = serde_json::json!([1e-9, 0, -1e-8, 1.0000001]);
+    assert!(read(&[rounded]).unwrap().damaged.is_empty());
     // Frames that --every skips are not reported.
     let mut lost = frame("2.jpg");
     lost["transform_matrix"] = serde_json::Value::Null;

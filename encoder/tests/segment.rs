@@ -239,6 +239,36 @@ fn run_length_files_of_every_form() {
     let given = GivenMasks::open(&whole, Vec::new()).unwrap();
     assert!(given.covers(&view("b.jpg", 8, 6)) && !given.covers(&view("c.jpg", 8, 6)));
 
+    // Polygons, clockwise or not, outside of the image, with holes by a second turn; several make one mask.
+    for polygons in [
+        vec![vec![1.2, 0.9, 6.7, 2.2, 3.1, 5.4]],
+        vec![vec![-3.0, -2.0, 4.5, 9.0, 20.0, 1.0], vec![0.0, 3.0, 0.0, 6.0, 2.0, 6.0, 2.0, 3.0]],
+        vec![vec![
+            0.0, 0.0, 8.0, 0.0, 8.0, 6.0, 0.0, 6.0, 0.0, 0.0, 2.0, 2.0, 2.0, 4.0, 5.0, 4.0, 5.0, 2.0, 2.0,
+            2.0,
+        ]],
+    ] {
+        // Oracle: crossings of a ray along x from each pixel's middle.
+        let inside = |points: &[f64], x: f64, y: f64| {
+            let n = points.len() / 2;
+            let crosses = |i: &usize| {
+                let [a, b] = [*i, (*i + 1) % n].map(|i| (points[2 * i], points[2 * i + 1]));
+                (a.1 > y) != (b.1 > y) && x < a.0 + (y - a.1) / (b.1 - a.1) * (b.0 - a.0)
+            };
+            (0..n).filter(crosses).count() % 2 == 1
+        };
+        let middle = |v: u32| f64::from(v) + 0.5;
+        let drawn = mask(8, 6, |x, y| polygons.iter().any(|p| inside(p, middle(x), middle(y))));
+        let data_set = serde_json::json!({"images": [{"id": 9, "file_name": "left/a.jpg", "width": 8, "height": 6}],
+            "annotations": [{"segmentation": polygons, "image_id": 9}]});
+        fs_err::write(&whole, data_set.to_string()).unwrap();
+        assert_eq!(load(&whole, &[], None).unwrap().unwrap(), [drawn.unwrap()], "{polygons:?}");
+    }
+    for (polygon, n) in [(&[1.0, 2.0][..], 2), (&[0.0; 7], 7)] {
+        let refused = Rle::from_polygons(8, 6, &[polygon.to_vec()]);
+        assert_eq!(refused, Err(RleError::Polygon { index: 0, n }));
+    }
+
     // Masks that would be lost, or assigned to another photo.
     for (images, id, expected) in [
         (r#"{"id": 8, "file_name": "left/a.jpg"}"#, "9", "mask 0 has image_id 9, which no image has"),

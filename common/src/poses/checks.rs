@@ -1,6 +1,6 @@
 //! Checks that the formats share: intrinsics, rotations and translations.
 
-use glam::{DAffine3, DMat3, DQuat, DVec3};
+use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
 
 use super::error::PoseProblem;
 use crate::camera::{Distortion, Intrinsics};
@@ -13,6 +13,9 @@ const MAX_TRANSLATION: f64 = 1e12;
 
 /// Largest deviation from unit length or orthonormality that counts as rounding; printouts with 3 decimals are below.
 const ROTATION_TOLERANCE: f64 = 5e-3;
+
+/// Largest deviation of a matrix's fourth row from 0 0 0 1 that counts as rounding, of products in 32 bits.
+const LAST_ROW_TOLERANCE: f64 = 1e-5;
 
 /// Checks intrinsics: sizes within 1..=65,535, focal lengths positive, everything finite.
 pub(super) fn check_intrinsics(
@@ -105,7 +108,8 @@ pub(super) fn affine_from_rows(image: &str, rows: &[Vec<f64>], axes: DMat3) -> R
     let ([Some(a), Some(b), Some(c)], true) = ([row(0), row(1), row(2)], matches!(rows.len(), 3 | 4)) else {
         return Err(PoseProblem::Expected { expected, found: format!("{} rows", rows.len()) });
     };
-    if rows.len() == 4 && row(3) != Some([0.0, 0.0, 0.0, 1.0]) {
+    let is_last = |row: [f64; 4]| DVec4::from(row).abs_diff_eq(DVec4::W, LAST_ROW_TOLERANCE);
+    if rows.len() == 4 && !row(3).is_some_and(is_last) {
         return Err(PoseProblem::Expected { expected, found: format!("{:?}", rows[3]) });
     }
     let rotation = DMat3::from_cols_array_2d(&[0, 1, 2].map(|column| [a[column], b[column], c[column]]));

@@ -21,17 +21,26 @@ const MAX_NAME_BYTES: u64 = 4096;
 /// Bytes of a 2D feature in `images.bin`: x, y (f64) and a point id (u64).
 const FEATURE_BYTES: u64 = 24;
 
-/// The supported lens models: number, name, number of parameters.
-const MODELS: [(i32, &str, usize); 6] = [
+/// The lens models: number, name, number of parameters.
+const MODELS: [(i32, &str, usize); 11] = [
     (0, "SIMPLE_PINHOLE", 3),
     (1, "PINHOLE", 4),
     (2, "SIMPLE_RADIAL", 4),
     (3, "RADIAL", 5),
     (4, "OPENCV", 8),
     (5, "OPENCV_FISHEYE", 8),
+    (6, "FULL_OPENCV", 12),
+    (7, "FOV", 5),
+    (8, "SIMPLE_RADIAL_FISHEYE", 4),
+    (9, "RADIAL_FISHEYE", 5),
+    (10, "THIN_PRISM_FISHEYE", 12),
 ];
 
-type Cameras = BTreeMap<u32, Intrinsics>;
+/// A camera that cannot be used is an error only where an image uses it.
+struct Cameras {
+    path: PathBuf,
+    of_id: BTreeMap<u32, (Place, Result<Intrinsics, PoseProblem>)>,
+}
 
 pub(super) fn read(
     model_dir: &Path,
@@ -127,8 +136,13 @@ fn default_images_dir(model_dir: &Path) -> Result<PathBuf, PoseError> {
     Ok(candidates.swap_remove(found))
 }
 
-/// Returns the intrinsics of a lens model; `params` has COLMAP's order.
-fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsics, PoseProblem> {
+/// Returns the intrinsics of a camera; `params` has COLMAP's order.
+fn intrinsics(
+    camera_id: u32,
+    model: &str,
+    size_px: [f64; 2],
+    params: &[f64],
+) -> Result<Intrinsics, PoseProblem> {
     let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
     let (focal, centre, distortion) = match (model, params) {
         ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], Distortion::None),
@@ -139,12 +153,19 @@ fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsi
         ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
             ([fx, fy], [cx, cy], Distortion::Fisheye { k: [k1, k2, k3, k4] })
         }
+        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k]) => {
+            ([f, f], [cx, cy], Distortion::Fisheye { k: [k, 0.0, 0.0, 0.0] })
+        }
+        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => {
+            ([f, f], [cx, cy], Distortion::Fisheye { k: [k1, k2, 0.0, 0.0] })
+        }
         _ => {
-            let expected = MODELS.iter().find(|(_, name, _)| *name == model).map_or(0, |(.., n)| *n);
-            return Err(PoseProblem::LensParameters {
-                model: model.to_owned(),
-                expected,
-                found: params.len(),
+            let model = excerpt(model);
+            return Err(match MODELS.iter().find(|(_, name, _)| *name == model) {
+                Some(&(.., expected)) if expected != params.len() => {
+                    PoseProblem::LensParameters { model, expected, found: params.len() }
+                }
+                _ => PoseProblem::UnsupportedModel { camera_id, model },
             });
         }
     };
@@ -190,8 +211,10 @@ impl Images {
         if name.is_empty() || name.contains('\0') || !is_inside(Path::new(&name)) {
             return Err(PoseProblem::UnsafeName { image: name }.at(model.path, place));
         }
-        let Some(intrinsics) = model.cameras.get(&camera_id).copied() else {
-            return Err(PoseProblem::UnknownCamera { image: name, camera_id }.at(model.path, place));
+        let intrinsics = match model.cameras.of_id.get(&camera_id) {
+            Some((_, Ok(intrinsics))) => *intrinsics,
+            Some((place, Err(problem))) => return Err(problem.clone().at(&model.cameras.path, *place)),
+            None => return Err(PoseProblem::UnknownCamera { image: name, camera_id }.at(model.path, place)),
         };
         match affine_from_wxyz(&name, wxyz, translation) {
             Err(problem) => self.damaged.add(&name, problem, model.path, place),
@@ -218,10 +241,21 @@ fn relative(name: &str) -> (String, bool) {
     (inside.to_owned(), is_foreign)
 }
 
-fn insert(cameras: &mut Cameras, camera_id: u32, camera: Intrinsics) -> Result<(), PoseProblem> {
-    match cameras.insert(camera_id, camera) {
-        None => Ok(()),
-        Some(_) => Err(PoseProblem::DuplicateCamera { camera_id }),
+impl Cameras {
+    fn new(path: &Path) -> Self {
+        Self { path: path.to_owned(), of_id: BTreeMap::new() }
+    }
+
+    fn insert(
+        &mut self,
+        camera_id: u32,
+        place: Place,
+        camera: Result<Intrinsics, PoseProblem>,
+    ) -> Result<(), PoseError> {
+        match self.of_id.insert(camera_id, (place, camera)) {
+            None => Ok(()),
+            Some(_) => Err(PoseProblem::DuplicateCamera { camera_id }.at(&self.path, place)),
+        }
     }
 }
 
@@ -288,28 +322,24 @@ fn take_numbers<const N: usize>(rest: &mut &str, expected: &'static str) -> Resu
 }
 
 fn cameras_from_text(path: &Path) -> Result<Cameras, PoseError> {
-    let mut cameras = Cameras::new();
+    let mut cameras = Cameras::new(path);
     let mut lines = Lines::open(path)?;
     while lines.advance_to_record()? {
-        let (camera_id, camera) = camera_from_line(&lines.line).map_err(|problem| lines.fail(problem))?;
-        insert(&mut cameras, camera_id, camera).map_err(|problem| lines.fail(problem))?;
+        let mut rest = lines.line.as_str();
+        let camera_id = take(&mut rest, "a camera id").map_err(|problem| lines.fail(problem))?;
+        cameras.insert(camera_id, Place::Line(lines.number), camera_from_words(camera_id, rest))?;
     }
     Ok(cameras)
 }
 
-fn camera_from_line(line: &str) -> Result<(u32, Intrinsics), PoseProblem> {
-    let mut rest = line;
-    let camera_id = take(&mut rest, "a camera id")?;
+fn camera_from_words(camera_id: u32, mut rest: &str) -> Result<Intrinsics, PoseProblem> {
     let model: String = take(&mut rest, "a lens model")?;
-    if !MODELS.iter().any(|(_, name, _)| *name == model) {
-        return Err(PoseProblem::UnsupportedModel { camera_id, model: excerpt(&model) });
-    }
     let size_px = take_numbers::<2>(&mut rest, "width and height in pixels")?;
     let mut params = Vec::new();
     while !rest.trim_start().is_empty() {
         params.push(take(&mut rest, "a lens parameter")?);
     }
-    Ok((camera_id, intrinsics(&model, size_px, &params)?))
+    intrinsics(camera_id, &model, size_px, &params)
 }
 
 fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Images, PoseError> {
@@ -434,7 +464,7 @@ impl Binary {
 }
 
 fn cameras_from_binary(path: &Path) -> Result<Cameras, PoseError> {
-    let mut cameras = Cameras::new();
+    let mut cameras = Cameras::new(path);
     let mut file = Binary::open(path)?;
     for _ in 0..file.u64("the number of cameras")? {
         let camera_id = file.u32("a camera id")?;
@@ -449,8 +479,8 @@ fn cameras_from_binary(path: &Path) -> Result<Cameras, PoseError> {
         for _ in 0..*n_params {
             params.push(f64::from_le_bytes(file.take("a lens parameter")?));
         }
-        let camera = intrinsics(model, size_px, &params).map_err(|problem| file.fail(problem))?;
-        insert(&mut cameras, camera_id, camera).map_err(|problem| file.fail(problem))?;
+        let camera = intrinsics(camera_id, model, size_px, &params);
+        cameras.insert(camera_id, Place::Byte(file.offset_bytes), camera)?;
     }
     file.expect_end()?;
     Ok(cameras)

@@ -12,6 +12,9 @@ use super::mask::{BoxPx, Mask};
 /// Most digits of a signed 32-bit number, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;
 
+/// Most crossings of a polygon with columns of pixels, so that no file takes all memory.
+const MAX_CROSSINGS: usize = 1 << 24;
+
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Rle {
     width_px: u32,
@@ -30,8 +33,15 @@ pub enum RleError {
     Run { index: usize },
     #[error("counts: invalid digit at byte {offset_bytes}; encode the mask again")]
     Digit { offset_bytes: usize },
-    #[error("found {n_polygons} polygons, expected run lengths; convert them with annToRLE of pycocotools")]
+    #[error(
+        "{n_polygons} polygons of an image whose width and height the file does not state; state them in `images`, or \
+         convert the polygons with annToRLE of pycocotools"
+    )]
     Polygons { n_polygons: usize },
+    #[error(
+        "polygon {index} has {n} numbers, expected x and y of 3 to a million points; draw the mask again"
+    )]
+    Polygon { index: usize, n: usize },
 }
 
 impl Rle {
@@ -52,6 +62,56 @@ impl Rle {
         } else {
             Err(RleError::Sum { expected, found })
         }
+    }
+
+    /// Takes polygons, each `x0, y0, x1, y1, ...` in pixels from the upper left corner. A pixel is inside if its middle
+    /// is, by the even-odd rule, in any of them.
+    ///
+    /// # Errors
+    /// [`RleError::Size`]; [`RleError::Polygon`] for one that is no polygon.
+    pub fn from_polygons(width_px: u32, height_px: u32, polygons: &[Vec<f64>]) -> Result<Self, RleError> {
+        if width_px.max(height_px) > u32::from(u16::MAX) {
+            return Err(RleError::Size { width_px, height_px });
+        }
+        let pixel = |at: f64, n: u32| (at - 0.5).ceil().clamp(0.0, f64::from(n)) as u32;
+        // First pixel and the one after the last, column-major.
+        let mut runs: Vec<(u32, u32)> = Vec::new();
+        for (index, polygon) in polygons.iter().enumerate() {
+            let points: Vec<[f64; 2]> = polygon.chunks_exact(2).map(|point| [point[0], point[1]]).collect();
+            let invalid = RleError::Polygon { index, n: polygon.len() };
+            if polygon.len() % 2 != 0 || points.len() < 3 || polygon.iter().any(|value| !value.is_finite()) {
+                return Err(invalid);
+            }
+            let mut crossings: Vec<(u32, f64)> = Vec::new();
+            for (a, b) in points.iter().zip(points.iter().cycle().skip(1)) {
+                let ([x0, y0], [x1, y1]) = if a[0] < b[0] { (*a, *b) } else { (*b, *a) };
+                let y_of = |column: u32| y0 + (f64::from(column) + 0.5 - x0) / (x1 - x0) * (y1 - y0);
+                crossings
+                    .extend((pixel(x0, width_px)..pixel(x1, width_px)).map(|column| (column, y_of(column))));
+                if crossings.len() > MAX_CROSSINGS {
+                    return Err(invalid);
+                }
+            }
+            // A closed outline crosses each column an even number of times.
+            crossings.sort_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+            let run = |pair: &[(u32, f64)]| {
+                let [first, after] =
+                    [pair[0].1, pair[1].1].map(|y| pair[0].0 * height_px + pixel(y, height_px));
+                (first < after).then_some((first, after))
+            };
+            runs.extend(crossings.chunks_exact(2).filter_map(run));
+        }
+        runs.sort_unstable();
+        let (mut counts, mut position) = (Vec::new(), 0);
+        for (first, after) in runs {
+            match counts.last_mut() {
+                Some(inside) if first <= position => *inside += after.saturating_sub(position),
+                _ => counts.extend([first - position, after - first]),
+            }
+            position = position.max(after);
+        }
+        counts.push(width_px * height_px - position);
+        Self::from_counts(width_px, height_px, counts)
     }
 
     pub fn from_text(width_px: u32, height_px: u32, text: &str) -> Result<Self, RleError> {

@@ -23,6 +23,13 @@ const CAMERA_CLEARANCE_M: f64 = 0.35;
 /// Poses tried for a thing before it is left out.
 const N_TRIES: usize = 30;
 const SHELL_M: f64 = 0.04;
+/// Distance between the rows of a warehouse.
+const ROW_M: f64 = 2.6;
+/// Kinds of things that stand in a warehouse's rows; those of a kind are equal.
+const N_ALIKE: usize = 6;
+/// Roberts' R2.
+const STEP: DVec2 = DVec2::new(0.754_877_666_246_692_7, 0.569_840_290_998_053_2);
+const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
 
 #[derive(Clone, Debug)]
 pub struct Placed {
@@ -42,6 +49,8 @@ pub enum Walk {
     Oval,
     /// All over each area, as of somebody who shows a robot where it may drive.
     Everywhere,
+    /// From 6 to 18 m above the ground, as of a drone; for scenes without a roof.
+    Above,
 }
 
 /// A piece of ground that things stand on and cameras walk through.
@@ -69,7 +78,7 @@ impl Layout {
     /// Furnishes scenes side by side along x. Equal seeds give equal layouts.
     pub fn new(kinds: &[SceneKind], seed: u64, colours: Colours<'_>) -> Self {
         let mut random = Xorshift::new(seed);
-        let outdoors = kinds.iter().any(|kind| *kind != SceneKind::Room);
+        let outdoors = kinds.iter().any(|kind| !kind.has_roof());
         let mut layout = Self {
             placed: Vec::new(),
             areas: Vec::new(),
@@ -87,6 +96,9 @@ impl Layout {
                 SceneKind::Street => {
                     (DVec2::new(random.between(20.0, 26.0), random.between(13.0, 15.0)), 6.0)
                 }
+                SceneKind::Warehouse => {
+                    (DVec2::new(random.between(15.0, 19.0), random.between(12.0, 14.0)), 5.0)
+                }
             };
             let area = Area { kind: *kind, corner, size, height_m };
             layout.furnish(&area, colours, &mut random);
@@ -103,7 +115,7 @@ impl Layout {
             Light::Lamp(at.extend(first.height_m - 0.15))
         };
         // No sunlight gets under the roof, so a room needs more ambient light.
-        if outdoors && kinds.contains(&SceneKind::Room) {
+        if outdoors && kinds.iter().any(|kind| kind.has_roof()) {
             layout.ambient = 0.75;
         }
         layout
@@ -134,15 +146,28 @@ impl Layout {
             }
         }
         let n_of_place = match area.kind {
-            SceneKind::Room => [(Place::Wall, 8), (Place::Floor, 4), (Place::Hung, 3), (Place::On, 5)],
-            SceneKind::Yard => [(Place::Wall, 7), (Place::Floor, 9), (Place::Hung, 0), (Place::On, 2)],
-            SceneKind::Street => [(Place::Wall, 8), (Place::Floor, 10), (Place::Hung, 0), (Place::On, 1)],
+            SceneKind::Room => {
+                vec![(Place::Wall, 8), (Place::Floor, 4), (Place::Hung, 3), (Place::On, 5)]
+            }
+            SceneKind::Yard => vec![(Place::Wall, 7), (Place::Floor, 9), (Place::On, 2)],
+            SceneKind::Street => vec![(Place::Wall, 8), (Place::Floor, 10), (Place::On, 1)],
+            SceneKind::Warehouse => {
+                vec![(Place::Row, 48), (Place::Wall, 8), (Place::Floor, 5), (Place::On, 10)]
+            }
         };
         for (place, n) in n_of_place {
             let mut choice = of_place(place);
             random.shuffle(&mut choice);
-            for noun in choice.into_iter().cycle().take(n) {
-                let object = make(&NOUNS[noun], random);
+            let mut alike = Vec::new();
+            if place == Place::Row {
+                choice.truncate(N_ALIKE);
+                alike = choice.iter().map(|noun| make(&NOUNS[*noun], random)).collect();
+            }
+            for (i, noun) in choice.iter().copied().cycle().take(n).enumerate() {
+                let object = match alike.get(i % choice.len()) {
+                    Some(object) => object.clone(),
+                    None => make(&NOUNS[noun], random),
+                };
                 let vehicle = NOUNS[noun].kinds.iter().any(|kind| kind == "vehicle");
                 for _ in 0..N_TRIES {
                     let Some(pose) = self.propose(area, place, &object, vehicle, random) else { break };
@@ -199,6 +224,13 @@ impl Layout {
                 let at = DVec2::new(random.between(low.x, high.x), random.between(low.y, high.y));
                 around_z(random.between(-pi, pi), at.extend(0.0))
             }
+            Place::Row => {
+                let n_rows = ((high.y - low.y - 4.0) / ROW_M).floor() as u32;
+                let row = random.below(n_rows as usize) as f64;
+                let at =
+                    DVec2::new(random.between(low.x + 1.0, high.x - 1.0), low.y + 2.0 + (row + 0.5) * ROW_M);
+                around_z(pi * random.below(2) as f64 + 0.04 * random.signed(), at.extend(0.0))
+            }
             Place::On => return self.on_top(area, own.size(), random),
             Place::Shell => return None,
         })
@@ -227,6 +259,7 @@ impl Layout {
     fn is_free(&self, bounds: &Aabb, place: Place) -> bool {
         let gap = match place {
             Place::Wall | Place::Floor => DVec3::new(GAP_M, GAP_M, 0.0),
+            Place::Row => DVec3::new(0.05, 0.05, 0.0),
             _ => DVec3::splat(0.02),
         };
         self.placed.iter().filter(|p| !p.shell).all(|p| {
@@ -252,14 +285,30 @@ impl Layout {
         match walk {
             Walk::Oval => self.walk(n_views, 0.0, photo_intrinsics()),
             Walk::Everywhere => self.roam(n_views, photo_intrinsics()),
+            Walk::Above => self.fly(n_views, photo_intrinsics()),
         }
+    }
+
+    /// Returns cameras above all areas, which look down by 45 to 80 degrees in headings of [`Layout::roam`].
+    fn fly(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
+        let (low, last) = (self.areas[0].corner, self.areas[self.areas.len() - 1]);
+        let size = last.corner + last.size - low;
+        let camera = |i: u32| {
+            let i = f64::from(i);
+            let spread = (STEP * (i + 1.0)).fract();
+            let height_m = 6.0 + 12.0 * (GOLDEN_ANGLE * i).fract();
+            let down = (45.0 + 35.0 * (STEP.x * GOLDEN_ANGLE * i).fract()).to_radians().tan();
+            let (sin, cos) = (GOLDEN_ANGLE * i).sin_cos();
+            // What the camera looks at lies over the area, not the camera.
+            let at = low + size * spread - DVec2::new(cos, sin) * height_m / down;
+            looking(at.extend(height_m), DVec3::new(cos, sin, -down))
+        };
+        (0..n_views).map(|i| RasterView { camera_from_world: camera(i), intrinsics }).collect()
     }
 
     /// Returns cameras all over the walkable places, with low-discrepancy places (Roberts' R2) and headings (golden
     /// angle); fewer than `n_views` if there is hardly room.
     fn roam(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
-        const STEP: DVec2 = DVec2::new(0.754_877_666_246_692_7, 0.569_840_290_998_053_2);
-        const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
         let tries = (0..20 * n_views).flat_map(|i| self.areas.iter().map(move |area| (f64::from(i), area)));
         let cameras = tries.filter_map(|(i, area)| {
             let at = area.corner + area.size * (0.5 + STEP * (i + 1.0)).fract();
@@ -307,7 +356,7 @@ impl Area {
         let (low, high) = (self.corner, self.corner + self.size);
         bounds.min.truncate().cmpge(low).all()
             && bounds.max.truncate().cmple(high).all()
-            && bounds.max.z <= if self.kind == SceneKind::Room { self.height_m } else { f64::INFINITY }
+            && bounds.max.z <= if self.kind.has_roof() { self.height_m } else { f64::INFINITY }
     }
 
     fn shell(&self, name: &str, object: &Object) -> Vec<Part> {

@@ -14,8 +14,9 @@
 //! ```
 //!
 //! - The file's name is the noun, `words` are its synonyms, `is` its kinds.
-//! - `found: SCENE PLACE`: scenes are `room`, `yard`, `street`; places are `floor` (free-standing), `wall` (its
-//!   back to a wall or an edge), `hung` (on a wall), `on` (on another thing's top), `shell` (built by the scene).
+//! - `found: SCENE PLACE`: scenes are `room`, `yard`, `street`, `warehouse`; places are `floor` (free-standing), `wall`
+//!   (its back to a wall or an edge), `hung` (on a wall), `on` (on another thing's top), `row` (beside its likes),
+//!   `shell` (built by the scene).
 //! - `paint NAME: MATERIALS | COLOURS`; the first paint gives the thing its main colour. `any` stands for all
 //!   colours, `same` for the first paint.
 //! - `let NAME = FROM..TO`, or `pick A, B, C`, or one expression. Metres; z points up, the ground is at 0.
@@ -60,6 +61,14 @@ pub enum SceneKind {
     Yard,
     /// Outdoors, a road with pavements.
     Street,
+    /// Indoors, rows of things alike.
+    Warehouse,
+}
+
+impl SceneKind {
+    pub(super) fn has_roof(self) -> bool {
+        matches!(self, Self::Room | Self::Warehouse)
+    }
 }
 
 /// Place of a thing in a scene.
@@ -73,6 +82,8 @@ pub enum Place {
     Hung,
     /// On the top of another thing.
     On,
+    /// In a row, beside its likes.
+    Row,
     /// Built by the scene: floors, walls.
     Shell,
 }
@@ -342,10 +353,10 @@ impl Noun {
 
 fn found(text: &str) -> Result<(SceneKind, Place), String> {
     let (scene, place) = text.split_once(' ').ok_or_else(|| format!("`{text}`, expected SCENE PLACE"))?;
-    let scene =
-        SceneKind::from_str(scene, false).map_err(|_| format!("`{scene}`, expected room, yard or street"))?;
+    let scene = SceneKind::from_str(scene, false)
+        .map_err(|_| format!("`{scene}`, expected room, yard, street or warehouse"))?;
     let place = Place::from_str(place.trim(), false)
-        .map_err(|_| format!("`{place}`, expected floor, wall, hung, on or shell"))?;
+        .map_err(|_| format!("`{place}`, expected floor, wall, hung, on, row or shell"))?;
     Ok((scene, place))
 }
 

@@ -210,7 +210,7 @@ mod tests {
     use slag_encoder::check::psnr_db;
     use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 
-    const KINDS: [SceneKind; 3] = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
+    const KINDS: [SceneKind; 4] = [SceneKind::Room, SceneKind::Yard, SceneKind::Street, SceneKind::Warehouse];
 
     #[test]
     fn things_stand_apart_and_within() {

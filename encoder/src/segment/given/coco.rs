@@ -1,7 +1,6 @@
 //! Run-length masks of JSON files: SAM's lists and COCO data sets.
 
 use std::collections::BTreeMap;
-use std::io::Read;
 use std::path::Path;
 
 use serde::Deserialize;
@@ -26,8 +25,12 @@ struct Annotation {
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum Segmentation {
-    Runs { size: [u32; 2], counts: Counts },
-    Polygons(Vec<serde::de::IgnoredAny>),
+    Runs {
+        size: [u32; 2],
+        counts: Counts,
+    },
+    /// Each `x0, y0, x1, y1, ...`, pixels.
+    Polygons(Vec<Vec<f64>>),
 }
 
 #[derive(Deserialize)]
@@ -48,17 +51,18 @@ struct MaskFile {
 struct DataSetImage {
     id: u64,
     file_name: String,
+    width: Option<u32>,
+    height: Option<u32>,
 }
 
 /// The masks of one photo, with their indices in the file.
 pub(super) fn read_list(path: &Path) -> Result<Vec<(usize, Rle)>, SegmentError> {
-    rles_of(path, parse(path)?.annotations)
+    rles_of(path, parse(path)?)
 }
 
 /// A list of masks, or an object with a list as `annotations`.
 fn parse(path: &Path) -> Result<MaskFile, SegmentError> {
-    let mut bytes = Vec::new();
-    files::open(path)?.read_to_end(&mut bytes)?;
+    let bytes = files::read(path)?;
     let text = files::text_of(&bytes);
     let text = text.map_err(|source| SegmentError::Text { path: path.to_owned(), source })?;
     let parsed = if text.trim_start().starts_with('[') {
@@ -69,15 +73,20 @@ fn parse(path: &Path) -> Result<MaskFile, SegmentError> {
     parsed.map_err(|source| SegmentError::Json { path: path.to_owned(), source })
 }
 
-fn rles_of(path: &Path, annotations: Vec<Annotation>) -> Result<Vec<(usize, Rle)>, SegmentError> {
-    let rle = |(index, annotation): (usize, Annotation)| match rle_of(annotation.segmentation) {
-        Ok(rle) => Ok((index, rle)),
-        Err(source) => Err(SegmentError::Rle { path: path.to_owned(), index, source }),
+fn rles_of(path: &Path, file: MaskFile) -> Result<Vec<(usize, Rle)>, SegmentError> {
+    let sizes_px: BTreeMap<u64, [u32; 2]> =
+        file.images.iter().filter_map(|image| Some((image.id, [image.width?, image.height?]))).collect();
+    let rle = |(index, annotation): (usize, Annotation)| {
+        let size_px = annotation.image_id.and_then(|id| sizes_px.get(&id).copied());
+        match rle_of(annotation.segmentation, size_px) {
+            Ok(rle) => Ok((index, rle)),
+            Err(source) => Err(SegmentError::Rle { path: path.to_owned(), index, source }),
+        }
     };
-    annotations.into_iter().enumerate().map(rle).collect()
+    file.annotations.into_iter().enumerate().map(rle).collect()
 }
 
-fn rle_of(segmentation: Segmentation) -> Result<Rle, RleError> {
+fn rle_of(segmentation: Segmentation, size_px: Option<[u32; 2]>) -> Result<Rle, RleError> {
     match segmentation {
         Segmentation::Runs { size: [height, width], counts: Counts::Text(text) } => {
             Rle::from_text(width, height, &text)
@@ -85,21 +94,26 @@ fn rle_of(segmentation: Segmentation) -> Result<Rle, RleError> {
         Segmentation::Runs { size: [height, width], counts: Counts::Runs(runs) } => {
             Rle::from_counts(width, height, runs)
         }
-        Segmentation::Polygons(list) => Err(RleError::Polygons { n_polygons: list.len() }),
+        Segmentation::Polygons(list) => match size_px {
+            Some([width, height]) => Rle::from_polygons(width, height, &list),
+            None => Err(RleError::Polygons { n_polygons: list.len() }),
+        },
     }
 }
 
 pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
-    let MaskFile { images, annotations } = parse(path)?;
-    let image_ids: Vec<Option<u64>> = annotations.iter().map(|annotation| annotation.image_id).collect();
+    let file = parse(path)?;
+    let image_ids: Vec<Option<u64>> = file.annotations.iter().map(|annotation| annotation.image_id).collect();
     let inconsistent = |what: String| SegmentError::DataSet { path: path.to_owned(), what };
     let mut rles_of_id: BTreeMap<u64, Vec<(usize, Rle)>> = BTreeMap::new();
-    for image in &images {
+    let names: Vec<_> =
+        file.images.iter().map(|image| (image.id, image.file_name.replace('\\', "/"))).collect();
+    for image in &file.images {
         if rles_of_id.insert(image.id, Vec::new()).is_some() {
             return Err(inconsistent(format!("two images have the id {}", image.id)));
         }
     }
-    for (index, rle) in rles_of(path, annotations)? {
+    for (index, rle) in rles_of(path, file)? {
         match image_ids[index].and_then(|id| rles_of_id.get_mut(&id)) {
             Some(rles) => rles.push((index, rle)),
             None => {
@@ -109,8 +123,7 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
         }
     }
     let mut named = MasksOfImage::new();
-    for DataSetImage { id, file_name } in images {
-        let file_name = file_name.replace('\\', "/");
+    for (id, file_name) in names {
         if named.insert(file_name.clone(), rles_of_id.remove(&id).unwrap_or_default()).is_some() {
             return Err(inconsistent(format!("two images have the file_name {file_name:?}")));
         }
