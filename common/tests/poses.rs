@@ -389,6 +389,18 @@ fn photos_and_models_are_found_and_choices_are_said() {
         "{:?}",
         text.notes
     );
+    write(
+        "transforms.json",
+        &serde_json::json!({"fl_x": 60, "w": 64, "h": 48, "frames": [frame("1.JPG")]}).to_string(),
+    );
+    let both = poses::read(dir.path(), None).unwrap();
+    assert!(
+        both.views.len() == 6 && both.notes.iter().any(|note| note.contains("transforms.json is ignored"))
+    );
+    fs_err::create_dir(dir.path().join("colmap")).unwrap();
+    fs_err::rename(dir.path().join("sparse"), dir.path().join("colmap/sparse")).unwrap();
+    let both = poses::read(dir.path(), None).unwrap();
+    assert!(both.views.len() == 1 && both.notes.iter().any(|note| note.contains("sparse/0 is ignored")));
 }
 
 /// NaN and a byte order mark are not JSON; paths of another machine are found by their suffix.
@@ -471,6 +483,10 @@ fn transforms_cameras_are_shared_or_per_frame() {
     assert_eq!(a.distortion, Distortion::Brown { k: [0.1, 0.0, 0.0], p: [0.0, 0.3] });
     assert_eq!((b.focal_x_px, b.focal_y_px, b.width_px, b.height_px), (70.0, 61.0, 100, 48));
     assert_eq!(b.distortion, Distortion::Fisheye { k: [0.2, 0.0, 0.0, 0.0] });
+    let listed = serde_json::json!({"fl_x": 60, "w": 64, "h": 48, "k1": 9, "frames": [frame("a.jpg")],
+        "distortion_params": [0.1, -0.2, 0.3, 0, 0.4, 0.5]});
+    let listed = read_json(listed).unwrap().views[0].intrinsics.distortion;
+    assert_eq!(listed, Distortion::Brown { k: [0.1, -0.2, 0.3], p: [0.4, 0.5] });
     // OpenGL cameras look along -z with y up: the point is 5 ahead of the camera and 1 above it.
     let in_camera = a_point_in_camera(&views[1], DVec3::new(1.0, 3.0, -2.0));
     assert!((in_camera - DVec3::new(0.0, -1.0, 5.0)).length() < 1e-12, "{in_camera}");
@@ -529,7 +545,9 @@ fn transforms_errors_have_place_and_fault() {
         (place, what),
         (Place::Frame(0), PoseProblem::UnsupportedLens { model: "EQUIRECTANGULAR".into() })
     );
-    assert!(matches!(with("k4", 0.1.into()).1, PoseProblem::UnsupportedLens { .. }));
+    for key in ["k4", "k5", "k6", "b1", "b2"] {
+        assert!(matches!(with(key, 0.1.into()).1, PoseProblem::UnsupportedLens { .. }), "{key}");
+    }
     assert!(matches!(with("w", 64.5.into()).1, PoseProblem::BadIntrinsics { .. }));
     assert!(with("h", serde_json::Value::Null).1.to_string().contains("its size is unknown"));
     assert!(matches!(with("fl_x", serde_json::Value::Null).1, PoseProblem::MissingIntrinsics { .. }));

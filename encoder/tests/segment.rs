@@ -206,6 +206,12 @@ fn soft_edges_are_no_ids() {
     write_png(&dir.path().join("left/a.png"), gray, eight, &ramp);
     let refused = load(dir.path(), &[], None).unwrap_err().to_string();
     assert!(refused.contains("soft edges: 18 values"), "{refused}");
+    // Ids 3 and 60 enlarged smoothly.
+    let seams: Vec<u8> =
+        (0..48).map(|at| [3, 3, 3, 15 + at / 8, 40 + at / 8, 60, 60, 60][at as usize % 8]).collect();
+    write_png(&dir.path().join("left/a.png"), gray, eight, &seams);
+    assert!(load(dir.path(), &[], None).unwrap_err().to_string().contains("INTER_NEAREST"));
+    write_png(&dir.path().join("left/a.png"), gray, eight, &ramp);
     // A black and white image of one mask is thresholded at half.
     fs_err::create_dir(dir.path().join("left/a")).unwrap();
     fs_err::rename(dir.path().join("left/a.png"), dir.path().join("left/a/0.png")).unwrap();

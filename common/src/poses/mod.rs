@@ -38,6 +38,10 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
             _ => Err(PoseError::NotFound { path: path.to_owned() }),
         };
     }
+    let json = path.join("transforms.json");
+    let other = |read: &Path, not: &Path| {
+        format!("read {}; {} is ignored: name it to read it", read.display(), not.display())
+    };
     let numbered = colmap::largest_model;
     let model_dirs =
         [Some(path.to_owned()), numbered(&path.join("sparse")), numbered(path), Some(path.join("sparse"))];
@@ -45,13 +49,17 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
         for (source, extension) in [(PoseSource::ColmapBinary, "bin"), (PoseSource::ColmapText, "txt")] {
             let has = |stem: &str| model_dir.join(stem).with_extension(extension).is_file();
             if has("cameras") && has("images") {
-                return colmap::read(&model_dir, source, images_dir);
+                let mut set = colmap::read(&model_dir, source, images_dir)?;
+                set.notes.extend(json.is_file().then(|| other(&model_dir, &json)));
+                return Ok(set);
             }
         }
     }
-    let json = path.join("transforms.json");
     if json.is_file() {
-        transforms::read(&json, images_dir)
+        let mut set = transforms::read(&json, images_dir)?;
+        let model = path.join("colmap/sparse/0");
+        set.notes.extend(model.is_dir().then(|| other(&json, &model)));
+        Ok(set)
     } else if path.join(scannet::POSES).is_dir() {
         scannet::read(path, images_dir)
     } else {

@@ -42,6 +42,12 @@ struct Camera {
     k4: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
+    k5: Option<f64>,
+    k6: Option<f64>,
+    b1: Option<f64>,
+    b2: Option<f64>,
+    /// k1, k2, k3, k4, p1, p2; goes before these (`nerfstudio_dataparser.py`).
+    distortion_params: Option<[f64; 6]>,
 }
 
 /// An element of `frames`.
@@ -308,6 +314,11 @@ impl Camera {
             k4: self.k4.or(shared.k4),
             p1: self.p1.or(shared.p1),
             p2: self.p2.or(shared.p2),
+            k5: self.k5.or(shared.k5),
+            k6: self.k6.or(shared.k6),
+            b1: self.b1.or(shared.b1),
+            b2: self.b2.or(shared.b2),
+            distortion_params: self.distortion_params.or(shared.distortion_params),
         }
     }
 
@@ -335,20 +346,26 @@ impl Camera {
 
     /// Returns the lens distortion; as in nerfstudio, every perspective model may have coefficients.
     fn distortion(&self) -> Result<Distortion, PoseProblem> {
-        let [k1, k2, k3, k4, p1, p2] =
-            [self.k1, self.k2, self.k3, self.k4, self.p1, self.p2].map(|c| c.unwrap_or(0.0));
+        let [k1, k2, k3, k4, p1, p2] = self.distortion_params.unwrap_or_else(|| {
+            [self.k1, self.k2, self.k3, self.k4, self.p1, self.p2].map(|c| c.unwrap_or(0.0))
+        });
+        // OpenCV's rational model, Metashape's affinity.
+        let further = [(self.k5, "k5"), (self.k6, "k6"), (self.b1, "b1"), (self.b2, "b2")];
+        let further = further.into_iter().find(|(value, _)| value.is_some_and(|value| value != 0.0));
         let fallback = if self.is_fisheye == Some(true) { "OPENCV_FISHEYE" } else { "OPENCV" };
-        match self.camera_model.as_deref().unwrap_or(fallback) {
+        let unsupported = |model: &str, with: &str| PoseProblem::UnsupportedLens {
+            model: format!("{model}{with}").chars().take(60).collect(),
+        };
+        let model = self.camera_model.as_deref().unwrap_or(fallback);
+        if let Some((_, key)) = further {
+            return Err(unsupported(model, &format!(" with {key}")));
+        }
+        match model {
             "OPENCV_FISHEYE" => Ok(Distortion::Fisheye { k: [k1, k2, k3, k4] }),
             "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" if k4 == 0.0 => {
                 Ok(Distortion::Brown { k: [k1, k2, k3], p: [p1, p2] })
             }
-            model => {
-                let with = if k4 == 0.0 { "" } else { " with k4" };
-                Err(PoseProblem::UnsupportedLens {
-                    model: format!("{model}{with}").chars().take(60).collect(),
-                })
-            }
+            model => Err(unsupported(model, if k4 == 0.0 { "" } else { " with k4" })),
         }
     }
 }

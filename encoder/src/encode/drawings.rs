@@ -13,7 +13,7 @@ use crate::store::remove_files;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
 
 /// Version of plan and drawings; a change redraws them.
-const PLAN_VERSION: u32 = 3;
+const PLAN_VERSION: u32 = 4;
 
 /// Draws a splat's planned views beside the poses file, unless they are there.
 pub(super) fn make(

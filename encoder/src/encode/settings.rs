@@ -262,7 +262,7 @@ impl EncodeSettings {
             inputs: InputSettings::new(scene, views, metric),
             view: ViewSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
-                min_mask_px: 200,
+                min_mask_px: 50,
                 raster_width: RasterWidth::Photo,
                 merges_slivers: true,
                 regions: Regions::Masks,

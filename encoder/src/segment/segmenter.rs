@@ -115,8 +115,8 @@ pub enum SegmentError {
     #[error("{}: found {found} pixels, expected ids; write a PNG with up to 16 bits of gray, or with a palette", path.display())]
     NotIds { path: PathBuf, found: &'static str },
     #[error(
-        "{}: soft edges: {n} values between black and white lie only where they meet, expected an id for each mask; write black \
-         where a pixel is outside, white where it is inside, nothing between", path.display()
+        "{}: soft edges: {n} values lie between others in seams of one or two pixels, expected an id for each mask; draw masks \
+         without antialiasing, and enlarge them by the nearest pixel (cv2.INTER_NEAREST)", path.display()
     )]
     SoftEdges { path: PathBuf, n: usize },
     #[error("{}: {what}; {advice}", path.display())]

@@ -16,7 +16,7 @@ const INDOOR: [(f64, f64); 2] = [(0.4, 0.05), (0.6, 0.25)];
 /// Free distance around a camera, as a share of the room's height.
 const CLEARANCE: f64 = 0.12;
 /// Heights of cameras above the ground, as shares of the scene's width, and how far they look down, radians.
-const OUTDOOR: [(f64, f64); 3] = [(0.05, 0.1), (0.1, 0.3), (0.2, 0.6)];
+const OUTDOOR: [(f64, f64); 3] = [(0.03, 0.05), (0.06, 0.15), (0.12, 0.4)];
 /// Rings around an object: elevation, radians, and distance as a share of the one at which it fills the image.
 const RINGS: [(f64, f64); 5] = [(0.1, 1.0), (0.1, 0.6), (0.45, 1.0), (0.45, 0.6), (0.95, 1.0)];
 const N_AROUND: usize = 24;

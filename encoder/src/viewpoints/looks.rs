@@ -19,8 +19,8 @@ const HAZY: f64 = 0.15;
 const NEAR: f64 = 0.035 * WIDTH;
 /// Standard deviation on the screen of a large Gaussian: 24 px of a photo 640 px wide.
 const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
-/// Least weight of a seen Gaussian, pixels of the drawing.
-const MIN_WEIGHT: f32 = 0.02;
+/// Least weight of a seen Gaussian, pixels of the drawing: 36 px of a photo 800 px wide.
+const MIN_WEIGHT: f32 = 0.09;
 /// Sides from which a Gaussian can be seen, around the vertical.
 const N_SIDES: usize = 8;
 /// Bytes of a look: eight per Gaussian, about three Gaussians per pixel.

@@ -1,5 +1,6 @@
 //! Ids of mask images.
 
+use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 
@@ -11,27 +12,28 @@ use crate::segment::segmenter::{SegmentError, SegmentInput};
 /// Memory for the PNG decoder beside the pixels.
 const PNG_OVERHEAD_BYTES: usize = 1 << 20;
 
-/// Least number of values between black and white in a single mask with soft edges.
+/// Least number of values in the seams of a blurred image.
 const MIN_SOFT: usize = 8;
-const WHITE: u32 = 255;
+/// Longest run of pixels in a seam.
+const MAX_SEAM_PX: usize = 2;
 
-/// Number of values between black and white in a mask with antialiased edges; `None` for ids, which have pixels whose
-/// neighbours all have the same id.
+/// Number of values in the seams of a mask image that was blurred, drawn with antialiasing or enlarged smoothly;
+/// `None` for one of ids. In seams, short runs have values between those beside them.
 pub(super) fn n_soft(ids: &[u32], width: usize) -> Option<usize> {
-    let mut is_found = [false; WHITE as usize + 1];
-    ids.iter().for_each(|id| is_found[(*id).min(WHITE) as usize] = true);
-    let n = is_found[1..WHITE as usize].iter().filter(|is_found| **is_found).count();
-    let has_white_alone = is_found[0] && ids.iter().max() == Some(&WHITE);
-    if n < MIN_SOFT || !has_white_alone {
-        return None;
+    let mut values = BTreeSet::new();
+    let (mut n_between, mut n_runs) = (0, 0);
+    for row in ids.chunks_exact(width.max(1)) {
+        let runs: Vec<&[u32]> = row.chunk_by(u32::eq).collect();
+        for sides in runs.windows(3) {
+            let [low, value, high] = [sides[0][0], sides[1][0], sides[2][0]];
+            n_runs += 1;
+            if sides[1].len() <= MAX_SEAM_PX && (low.min(high) < value && value < low.max(high)) {
+                n_between += 1;
+                values.insert(value);
+            }
+        }
     }
-    let between = || ids.iter().enumerate().filter(|(_, id)| (1..WHITE).contains(*id));
-    let is_inside = |(at, id): &(usize, &u32)| {
-        let neighbours = [at.wrapping_sub(width), at.wrapping_sub(1), at + 1, at + width];
-        neighbours.iter().all(|at| ids.get(*at) == Some(*id))
-    };
-    // The tails of a blur are flat here and there.
-    (10 * between().filter(is_inside).count() < between().count()).then_some(n)
+    (values.len() >= MIN_SOFT && 4 * n_between > n_runs).then_some(values.len())
 }
 
 /// Ids of a PNG of the photo's size, row-major; of a palette, the indices.
