@@ -67,7 +67,7 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
         let map = goal::floor_map(&on_board.snapshot, &request, &Budget::default()).map_err(failure)?;
         durable::write_result(path, |file| map.write_pgm(file))?;
     }
-    let reply = goal::find(&engine, &on_board, &request, &Budget::default()).map_err(failure)?;
+    let reply = goal::find(&on_board, &request, &Budget::default()).map_err(failure)?;
     if args.json {
         return print_json(&reply);
     }

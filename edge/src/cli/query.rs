@@ -100,13 +100,13 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
-    let reply = engine.answer(request, &Budget::default())?;
+    let reply = engine.on_board()?.answer(request, &Budget::default())?;
     if let Some(path) = &args.ply {
         write_ply(&reply, path)?;
     }
     match args.json {
         true => write_json(reply),
-        false => reply.answers().try_for_each(|answers| print_answers(&reply, answers)),
+        false => reply.answers.iter().try_for_each(|answers| print_answers(&reply, answers)),
     }
 }
 

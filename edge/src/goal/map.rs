@@ -33,7 +33,7 @@ pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) ->
         paths.find(0..seen.is_safe.len());
         paths
     });
-    budget.check().map_err(GoalError::spent)?;
+    budget.check()?;
     let window = &seen.space.window;
     let [n_x, n_y] = window.cells();
     let place = |x: usize, y: usize| {

@@ -135,9 +135,9 @@ impl<'a> Surroundings<'a> {
         let step = (step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
         let window = Window::around(near, request.robot.range_m, voxel);
         budget.take(window.cells().iter().product::<usize>() * CELL_BYTES);
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         let gathered = Space::gather(window, occupancies, budget);
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         let space = gathered
             .ok_or_else(|| too_far("a smaller range: there are more than 8 million blocks".into()))?;
         // A column has 128 voxels, so no higher robot has headroom.
@@ -148,12 +148,12 @@ impl<'a> Surroundings<'a> {
             None => vec![false; ground.floors.len()],
         };
         ground.block_slopes(request.robot.slope, step, voxel);
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         let obstacles = clearance::obstacles(&ground, step);
         let clearance = Clearance::new(&obstacles, ground.n_y);
         let least = (request.robot.radius_m / voxel).powi(2).ceil() as u32;
         let is_safe = clearance.at_least(least.max(1));
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         Ok(Self { space, ground, is_continued, clearance, is_safe, step, budget })
     }
 

@@ -99,6 +99,10 @@ pub fn follower_failed(failure: &str) -> Problem {
         .retry_after(FOLLOWER_RETRY_SECS)
 }
 
+pub fn spent(error: OverBudget) -> Problem {
+    query_problem(error.into())
+}
+
 pub fn query_problem(error: QueryError) -> Problem {
     let (kind, detail) = (error.kind(), error.to_string());
     let unavailable = |title| {

@@ -100,7 +100,7 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
     // Before the clock starts: a budget of zero is refused, not overrun.
     let answering = app.within_limits(ask.time_budget()?, move |app, budget| {
         let reply = app.engine.ask(ask, budget).map_err(query_problem)?;
-        let n_empty = reply.outcomes.iter().filter(|outcome| outcome.is_empty()).count();
+        let n_empty = reply.answers.iter().filter(|of| of.answers.is_empty()).count();
         app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
         let Some(format) = format else {
             return Ok((serde_json::to_vec(&Page::of(&reply)).map_err(Problem::internal)?, None));

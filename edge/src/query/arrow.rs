@@ -48,7 +48,7 @@ impl Pieces {
             self.writer = Some(writer);
             return Ok(piece);
         };
-        let gaussians = |question: usize| match self.reply.answers().nth(question).map(|a| &a.answers) {
+        let gaussians = |question: usize| match self.reply.answers.get(question).map(|a| &a.answers) {
             Some(Found::Gaussians(hits)) => Some(&hits[..]),
             Some(Found::Clusters(_)) => Some(&[][..]),
             None => None,
@@ -87,7 +87,7 @@ impl Iterator for Pieces {
 fn schema(reply: &Reply) -> Schema {
     let column = |name: &str, kind: DataType| Field::new(name, kind, false);
     let mut columns = Vec::new();
-    if reply.outcomes.len() != 1 {
+    if reply.answers.len() != 1 {
         columns.push(column("question", DataType::UInt32));
     }
     columns.extend(["x", "y", "z"].map(|name| column(name, DataType::Float64)));
@@ -101,9 +101,9 @@ fn schema(reply: &Reply) -> Schema {
         ("scene".to_owned(), manifest.scene.clone()),
         ("generation".to_owned(), manifest.generation.to_string()),
         ("frame".to_owned(), "world".to_owned()),
-        ("questions".to_owned(), json(serde_json::to_string(&reply.answers().collect::<Vec<_>>()))),
+        ("questions".to_owned(), json(serde_json::to_string(&reply.answers))),
     ]);
-    if let Some(first) = reply.answers().next() {
+    if let Some(first) = reply.answers.first() {
         let kind = serde_json::to_value(first.searched.score_kind).ok();
         let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default();
         metadata.insert("unit".into(), first.unit.into());
@@ -123,7 +123,7 @@ fn batch(
     question: usize,
     items: std::ops::Range<usize>,
 ) -> Result<RecordBatch, ArrowError> {
-    let hits = match reply.answers().nth(question).map(|answers| &answers.answers) {
+    let hits = match reply.answers.get(question).map(|answers| &answers.answers) {
         Some(Found::Gaussians(hits)) => &hits[items],
         _ => &[],
     };
@@ -134,7 +134,7 @@ fn batch(
         Arc::new(Float64Array::from_iter_values(positions.iter().map(|position| position[axis])))
     };
     let mut columns: Vec<ArrayRef> = Vec::new();
-    if reply.outcomes.len() != 1 {
+    if reply.answers.len() != 1 {
         columns.push(Arc::new(UInt32Array::from_value(question as u32, hits.len())));
     }
     columns.extend((0..3).map(|axis| along(axis) as ArrayRef));

@@ -11,7 +11,7 @@ use slag_common::objects::{self, Moved, Thing, public_id};
 use super::engine::{Engine, QueryError};
 use super::request::RequestError;
 use super::scene::unit;
-use crate::score::{Budget, ScoreError};
+use crate::score::Budget;
 use crate::store::history::{self, Record};
 use crate::store::{EdgeCache, Snapshot};
 
@@ -79,8 +79,7 @@ impl Engine {
         let of_thing =
             size_of::<Thing>() + size_of::<ChangedThing>() + size_of::<f64>() * manifest.encoder.dim as usize;
         budget.take(2 * of_thing * snapshot.objects.len());
-        let spent = |error| QueryError::from(ScoreError::from(error));
-        budget.check().map_err(spent)?;
+        budget.check().map_err(QueryError::from)?;
         let generations = known(self.cache(), manifest);
         let to = generation(self.cache(), snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
         let from = match request.from {
@@ -101,7 +100,7 @@ impl Engine {
         {
             return Err(ChangesError::Encoders { from: from.generation, to: to.generation });
         }
-        budget.check().map_err(spent)?;
+        budget.check().map_err(QueryError::from)?;
         Ok(reply(from, to, manifest, generations, request, &words))
     }
 }

@@ -7,21 +7,16 @@ use std::time::{Duration, Instant};
 use slag_api::objects::OrientedBox;
 use slag_common::Hash32;
 use slag_common::manifest::{Manifest, TextModelRecord};
-use slag_common::objects::Objects;
-use slag_common::shard::ShardView;
 use slag_models::{InferenceError, ModelDir, SessionOptions};
 
 use super::names::{Names, Words};
 use super::relations;
 use super::request::{QueryRequest, RequestError, check_text};
-use super::scene::Scene;
-use crate::score::{Budget, OverBudget, ScoreError, Scratch};
+use crate::score::{OverBudget, ScoreError};
 use crate::store::files::Stat;
 use crate::store::{EdgeCache, Snapshot, StoreError, damaged};
 use crate::text::{EncoderInfo, TextError, TextOpenError, TextService};
 
-/// Buffers of answers that used more are dropped.
-const KEPT_BYTES: u64 = 32 << 20;
 /// Retry interval of a failed load while `current` is unchanged: disk full, too many open files.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
@@ -41,6 +36,12 @@ pub enum QueryError {
     EncoderMismatch { models_name: String, models_id: Hash32, scene_name: String, scene_id: Hash32 },
     #[error(transparent)]
     Score(#[from] ScoreError),
+}
+
+impl From<OverBudget> for QueryError {
+    fn from(error: OverBudget) -> Self {
+        Self::Score(error.into())
+    }
 }
 
 impl QueryError {
@@ -133,21 +134,13 @@ pub struct Engine {
     carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
     pub(super) words: Mutex<Option<Arc<Words>>>,
-    /// Buffers of finished answers, one per concurrent answer.
-    idle: Mutex<Vec<Scratch>>,
 }
 
 impl Engine {
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
         let (text, listed) = (Arc::new(text), Arc::default());
         let loaded = Loaded { text, snapshot: None, listed, tried: None, failed_at: None };
-        Self {
-            cache,
-            carried: None,
-            loaded: RwLock::new(loaded),
-            words: Mutex::default(),
-            idle: Mutex::default(),
-        }
+        Self { cache, carried: None, loaded: RwLock::new(loaded), words: Mutex::default() }
     }
 
     /// Makes an engine that uses each scene's own text model if it has one, else that of `otherwise`.
@@ -231,31 +224,6 @@ impl Engine {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
         Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), listed: Arc::clone(&loaded.listed) })
-    }
-
-    /// Runs work on a generation, reusing buffers.
-    pub(super) fn on_scene<T>(
-        &self,
-        snapshot: &Snapshot,
-        budget: &Budget,
-        work: impl FnOnce(&mut Scratch, &Scene<'_>) -> T,
-    ) -> T {
-        let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
-        let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
-        let objects: Vec<Option<Objects<'_>>> =
-            snapshot.shards.iter().map(|shard| shard.additions().objects).collect();
-        let (index, manifest) = (&snapshot.objects, &snapshot.manifest);
-        let bad_cells = &snapshot.bad_cells;
-        let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched, bad_cells };
-        let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut scratch = idle().pop().unwrap_or_default();
-        scratch.set_budget(budget.clone());
-        let done = work(&mut scratch, &scene);
-        scratch.set_budget(Budget::default());
-        if budget.used_bytes() <= KEPT_BYTES {
-            idle().push(scratch);
-        }
-        done
     }
 }
 

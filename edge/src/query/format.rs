@@ -91,9 +91,9 @@ impl JsonPieces {
     }
 
     fn fill(&mut self, piece: &mut Vec<u8>) -> io::Result<()> {
-        let is_batch = self.reply.outcomes.len() != 1;
+        let is_batch = self.reply.answers.len() != 1;
         while !self.is_closed && piece.len() < JSON_PIECE_BYTES {
-            let Some(answers) = self.reply.answers().nth(self.question) else {
+            let Some(answers) = self.reply.answers.get(self.question) else {
                 self.is_closed = true;
                 if is_batch {
                     piece.extend(b"]}");

@@ -33,7 +33,7 @@ struct Place {
 impl<R: Borrow<Reply>> Pieces<R> {
     pub fn new(reply: R) -> Self {
         let properties = PointProperties {
-            question: reply.borrow().outcomes.len() != 1,
+            question: reply.borrow().answers.len() != 1,
             shard_index: true,
             input_index: reply.borrow().snapshot.shards.iter().all(|shard| shard.view().has_input_indices()),
         };
@@ -45,18 +45,18 @@ impl<R: Borrow<Reply>> Pieces<R> {
         let manifest = &reply.snapshot.manifest;
         let unit = unit(manifest);
         let mut comments: Vec<String> =
-            reply.answers().map(|answers| format!("text {}", answers.text)).collect();
+            reply.answers.iter().map(|answers| format!("text {}", answers.text)).collect();
         comments.push(format!("scene {}", manifest.scene));
         comments.push(format!("generation {}", manifest.generation));
         comments.push(format!("unit {unit}"));
-        self.properties.header(reply.answers().map(n_points).sum(), &comments)
+        self.properties.header(reply.answers.iter().map(n_points).sum(), &comments)
     }
 
     /// Appends points to a piece until it is full or none is left.
     fn fill(&mut self, piece: &mut Vec<u8>) {
         let reply = self.reply.borrow();
         let shards: Vec<_> = reply.snapshot.shards.iter().map(|shard| shard.view()).collect();
-        while let Some(answers) = reply.answers().nth(self.at.question) {
+        while let Some(answers) = reply.answers.get(self.at.question) {
             let Some(run) = run(answers, self.at.answer, self.at.run) else {
                 self.at = match self.at.answer + 1 < answers.answers.len() {
                     true => Place { answer: self.at.answer + 1, run: 0, member: 0, ..self.at },

@@ -68,10 +68,9 @@ fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     engine.reload().map_err(|e| slag_edge::error_line(&e))?;
     let request =
         QueryRequest { kind: Some(AnswerKind::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };
-    let reply = engine
-        .answer(request, &slag_edge::score::Budget::default())
-        .map_err(|e| slag_edge::error_line(&e))?;
-    let answers = reply.answers().next().expect("of one text");
+    let on_board = engine.on_board().map_err(|e| e.to_string())?;
+    let reply = on_board.answer(request, &slag_edge::score::Budget::default()).map_err(|e| e.to_string())?;
+    let answers = reply.answers.first().expect("of one text");
     let found = reply.gaussians(answers).iter().map(|g| place(g.position_in_world.into())).collect();
     Ok((answers.generation, found))
 }

@@ -14,10 +14,10 @@ use slag_service::problem::Problem;
 
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, XyText, XyzText};
-use crate::http::problem::query_problem;
+use crate::http::problem::{query_problem, spent};
 use crate::locate::{Answer, Camera, LocateError, PhotoFile, answer, map_working_bytes};
-use crate::query::{Point, QueryError, RequestError};
-use crate::score::{MAX_COORDINATE, ScoreError};
+use crate::query::{Point, RequestError};
+use crate::score::MAX_COORDINATE;
 
 pub const PHOTOS: &[&str] = &["image/jpeg", "image/png", "image/webp"];
 
@@ -84,12 +84,11 @@ pub async fn locate(
             let position_in_world = near.in_world("near", &snapshot.manifest)?;
             camera.prior = Some(Prior { position_in_world, sigma });
         }
-        let over_budget = |spent| query_problem(QueryError::Score(ScoreError::OverBudget(spent)));
         budget.take(PhotoFile::opening_bytes(&photo));
-        budget.check().map_err(over_budget)?;
+        budget.check().map_err(spent)?;
         let opened = PhotoFile::open(&photo).map_err(problem)?;
         budget.take(opened.working_bytes() + map_working_bytes(&snapshot));
-        budget.check().map_err(over_budget)?;
+        budget.check().map_err(spent)?;
         answer(&snapshot, opened, &camera, budget).map(Json).map_err(problem)
     })
     .await

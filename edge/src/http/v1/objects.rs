@@ -16,8 +16,8 @@ use slag_service::replies::{As, Binary, Described, Reply};
 
 use crate::http::app::App;
 use crate::http::forms::{AreaParams, BallParams, ObjectIdText};
-use crate::http::problem::query_problem;
-use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError};
+use crate::http::problem::{query_problem, spent};
+use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError, Scene};
 use crate::store::Snapshot;
 
 const DEFAULT_PAGE: usize = 100;
@@ -120,7 +120,8 @@ pub async fn one(
         let on_board = app.engine.on_board().map_err(query_problem)?;
         let snapshot = &on_board.snapshot;
         let names = app.engine.names(&on_board, NAMES_WAIT, budget).map_err(query_problem)?;
-        let found = app.engine.object(snapshot, names, wanted, budget).map_err(query_problem)?;
+        let found = Scene::of(snapshot).object(wanted, names, budget);
+        budget.check().map_err(spent)?;
         found.map(Json).ok_or_else(|| not_on_board(&id, snapshot))
     })
     .await
@@ -134,7 +135,9 @@ pub async fn thumbnail(
     let wanted = wanted(&id)?;
     let picture = app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let picture = app.engine.thumbnail(&snapshot, wanted, budget).map_err(query_problem)?;
+        let picture = Scene::of(&snapshot).thumbnail(wanted);
+        budget.take(picture.iter().flatten().map(Vec::len).sum());
+        budget.check().map_err(spent)?;
         picture.ok_or_else(|| not_on_board(&id, &snapshot))?.ok_or_else(|| {
             let detail = format!(
                 "{id} has no small picture on board; balanced and exact shards carry them, and compact ones of a store encoded with --appearance"

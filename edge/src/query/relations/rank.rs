@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::candidates::{Candidate, SURE, Things};
 use super::geometry::{self, HOLDS, Solid, Viewer};
 use super::phrase::{By, Phrase, Pick, Place};
-use crate::query::answers::{Reason, ReasonKind};
+use crate::query::reason::{Reason, ReasonKind};
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
