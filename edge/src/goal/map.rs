@@ -6,7 +6,6 @@ use glam::DVec3;
 use slag_api::floor::Place;
 
 use super::ground::Floor;
-use super::paths::Paths;
 use super::request::{GoalError, GoalRequest};
 use super::surroundings::Surroundings;
 use crate::score::Budget;
@@ -29,7 +28,7 @@ pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) ->
     let seen = Surroundings::look(snapshot, request, near, budget)?;
     let start = seen.start(near, request.robot.radius_m);
     let paths = start.map(|start| {
-        let mut paths = Paths::from(start, &seen.is_safe, &seen.ground, seen.step);
+        let mut paths = seen.paths_from(start);
         paths.find(0..seen.is_safe.len());
         paths
     });

@@ -67,43 +67,13 @@ const NTH: [&str; 12] = [
 ];
 const ARTICLES: [&str; 4] = ["the", "a", "an", "my"];
 /// Words before the thing asked for, one after another.
-const OPENINGS: [&str; 16] = [
-    "please",
-    "where is",
-    "where are",
-    "where's",
-    "find me",
-    "find",
-    "show me",
-    "go to",
-    "bring me",
-    "look for",
-    "take me to",
-    "is there",
-    "are there",
-    "any",
-    "all of",
-    "all",
-];
+const OPENINGS: &str = "please, where is, where are, where's, find me, find, show me, go to, bring me, look for, \
+    take me to, is there, are there, any, all of, all";
 /// Words before a relation that ask for any thing.
 const ANY: [&str; 3] = ["what is", "what's", "what are"];
 const NEGATIONS: [&str; 4] = ["not", "isn't", "aren't", "never"];
 /// Words that make "within" a distance.
-const UNITS: [&str; 13] = [
-    "m",
-    "metre",
-    "metres",
-    "meter",
-    "meters",
-    "cm",
-    "centimetres",
-    "centimeters",
-    "foot",
-    "feet",
-    "ft",
-    "inches",
-    "yards",
-];
+const UNITS: &str = "m metre metres meter meters cm centimetres centimeters foot feet ft inches yards";
 
 /// Parses a text as a phrase; `None` if it names no relation and no pick, or is too long: it is then one thing, for
 /// the text model. [`Phrase::check`] checks the limits.
@@ -136,7 +106,7 @@ fn refuse(words: &[&str]) -> Result<(), RequestError> {
             let advice = format!("no {here:?}, which relations do not understand; ask for {named:?} alone");
             return refused(words.join(" "), advice);
         }
-        if here == "within" && after.iter().take(3).any(|word| UNITS.contains(word)) {
+        if here == "within" && after.iter().take(3).any(|word| UNITS.split(' ').any(|unit| unit == *word)) {
             let advice =
                 "near in place of a distance, or the distance as radius around a position given as near";
             return refused(words[at..].join(" "), advice.to_owned());
@@ -193,7 +163,7 @@ fn words_of(text: &str) -> Vec<String> {
 /// Returns the number of words before the thing asked for.
 fn opening(words: &[&str]) -> usize {
     let mut n = 0;
-    while let Some(more) = OPENINGS.iter().filter_map(|opening| starts(&words[n..], opening)).max() {
+    while let Some(more) = OPENINGS.split(", ").filter_map(|opening| starts(&words[n..], opening)).max() {
         n += more;
     }
     n
