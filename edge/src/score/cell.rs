@@ -77,10 +77,6 @@ impl<'a> Search<'a> {
     /// Returns the question's view of a shard; `None` if the shard was not searched.
     pub(super) fn cell(&'a self, at: usize) -> Option<Cell<'a>> {
         let (shard, scores) = (&self.shards[at], self.scored[at].as_ref()?);
-        let centroids = match self.places.len() {
-            1 => &scores.centroids[self.places[0]],
-            _ => &scores.combined[self.index],
-        };
         let detail = match (&shard.exact, &shard.residuals) {
             _ if self.precision == Precision::Centroids => Detail::Nothing,
             // Codes with unmeasured errors cannot decide.
@@ -100,7 +96,7 @@ impl<'a> Search<'a> {
             shard,
             asked: self,
             scores,
-            centroids,
+            centroids: &scores.combined[self.index],
             detail,
             filter,
             instructions: InstructionSet::widest(),

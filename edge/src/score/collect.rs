@@ -11,7 +11,7 @@ use super::dot::EmbeddingTimesVector;
 use super::matches::{Matches, Run};
 use super::region::Region;
 use super::search::{Search, combine};
-use super::simd::{BlockSums, FindSums, LastBlock, SomeRowsTimesVector};
+use super::simd::{BlockSums, FindSums, LastBlock, RowsTimesVector};
 
 /// Number of bins; counting locates a rank's score before anything is sorted.
 pub(super) const BINS: usize = 4096;
@@ -59,7 +59,6 @@ struct Refine {
     /// Undecided members: index in `members`, and the score of the code.
     undecided: Vec<(usize, f32)>,
     which: Vec<u32>,
-    products: Vec<i32>,
     /// `[vectors][undecided]`.
     scores: Vec<f32>,
 }
@@ -253,7 +252,7 @@ impl Cell<'_> {
     /// Refines the scores of undecided members by fine residuals and embeddings, and drops non-matches.
     fn refine(&self, gather: &mut Gather, measured: &Measured<'_>, centroid: usize, cut: Cut) {
         let Gather { refine, found, .. } = gather;
-        let Refine { members, undecided, which, products, scores } = refine;
+        let Refine { members, undecided, which, scores } = refine;
         undecided.clear();
         which.clear();
         for (place, (at, score)) in members.iter().enumerate() {
@@ -267,20 +266,17 @@ impl Cell<'_> {
             scores.clear();
             for place in &self.asked.places {
                 let rounded = &self.scores.projections[*place].fine;
-                let n_components = self.shard.header.n_components as usize;
-                let (rows, vector) = (fine.values, &rounded.steps[..]);
-                self.instructions.dispatch(SomeRowsTimesVector {
-                    rows,
-                    n_components,
-                    vector,
+                let products = self.instructions.dispatch(RowsTimesVector {
+                    rows: fine.values,
+                    n_components: self.shard.header.n_components as usize,
+                    vector: &rounded.steps,
                     which,
-                    products,
                 });
                 let (own, step) = (
                     self.scores.centroids[*place][centroid],
                     f64::from(fine.scales[centroid]) * rounded.step,
                 );
-                scores.extend(products.iter().map(|product| own + (step * f64::from(*product)) as f32));
+                scores.extend(products.into_iter().map(|product| own + (step * f64::from(product)) as f32));
             }
             for (number, (place, _)) in undecided.iter().enumerate() {
                 let mut products = scores[number..].iter().step_by(which.len()).copied();

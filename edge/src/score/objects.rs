@@ -14,7 +14,7 @@ use super::budget::ScoreError;
 use super::project::{Projection, Vector, up};
 use super::question::{Question, check};
 use super::search::{combine, distinct};
-use super::simd::SomeRowsTimesVector;
+use super::simd::RowsTimesVector;
 use crate::store::objects::ObjectIndex;
 
 /// Objects scored at a time; their products stay in the L1 cache.
@@ -83,23 +83,16 @@ fn of_vector(
     let projection = Projection::new(instructions, shard, vector);
     let (n_vectors, n_components) = (objects.header.n_vectors, shard.header.n_components as usize);
     let mut scores = Vec::with_capacity(which.len());
-    let (mut rows, mut products, mut largest_step) = (Vec::new(), Vec::new(), 0.0f32);
+    let mut largest_step = 0.0f32;
     for which in which.chunks(TOGETHER) {
-        rows.clear();
-        rows.extend(which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors));
-        let vector = &projection.rounded.steps[..];
-        products.clear();
-        // Vectors without components equal the mean.
-        match n_components {
-            0 => products.resize(rows.len(), 0),
-            _ => instructions.dispatch(SomeRowsTimesVector {
-                rows: objects.vectors,
-                n_components,
-                vector,
-                which: &rows,
-                products: &mut products,
-            }),
-        }
+        let rows = which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors);
+        let rows: Vec<u32> = rows.collect();
+        let products = instructions.dispatch(RowsTimesVector {
+            rows: objects.vectors,
+            n_components,
+            vector: &projection.rounded.steps,
+            which: &rows,
+        });
         for (rows, products) in rows.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize)) {
             let mut cosines = [0.0; MAX_VECTORS as usize];
             for ((cosine, row), product) in cosines.iter_mut().zip(rows).zip(products) {

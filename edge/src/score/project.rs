@@ -14,7 +14,7 @@ use slag_common::shard::{BLOCK, CODEWORDS, Residuals, ShardView};
 use slag_math::simd::InstructionSet;
 
 use super::dot::widen;
-use super::simd::{Column, MatrixTimesVector, PAD};
+use super::simd::{Column, PAD, RowsTimesVector};
 
 /// Largest sum of absolute steps: times the 128 of a centroid's largest component it still fits in 32 bits.
 const MOST_IN_SUM: u64 = (1 << 24) - 1;
@@ -107,15 +107,14 @@ impl Projection {
             return Self { components, rounded, error_per_length, ..Self::default() };
         };
         let m = shard.header.n_components as usize;
-        let mut components = vec![0.0; m];
-        instructions.dispatch(MatrixTimesVector {
+        let products = instructions.dispatch(RowsTimesVector {
             rows: basis.vectors,
             n_components: vector.exact.len(),
             vector: &vector.rounded.steps,
-            put: |at: usize, dot: i32| {
-                components[at] = f64::from(basis.steps[at]) * (vector.rounded.step * f64::from(dot));
-            },
+            which: &(0..m as u32).collect::<Vec<_>>(),
         });
+        let scaled = |(step, dot): (&f32, i32)| f64::from(*step) * (vector.rounded.step * f64::from(dot));
+        let components: Vec<f64> = basis.steps.iter().zip(products).map(scaled).collect();
         let mean = || basis.mean.iter().map(|v| f64::from(widen(*v)));
         let (rounded, step) = (Rounded::new(&components), f64::from(shard.header.centroid_step));
         Self {
@@ -131,19 +130,15 @@ impl Projection {
 
     /// Scores a cell's centroids. Returns `[K]`.
     pub(crate) fn score_centroids(&self, instructions: InstructionSet, shard: &ShardView<'_>) -> Vec<f32> {
-        // Centroids without components equal the mean.
-        let mut scores = vec![self.base as f32 + 0.0; shard.header.n_centroids as usize];
         let step = f64::from(shard.header.centroid_step) * self.rounded.step;
-        instructions.dispatch(MatrixTimesVector {
+        let products = instructions.dispatch(RowsTimesVector {
             rows: shard.centroids,
             n_components: shard.header.n_components as usize,
             vector: &self.rounded.steps,
-            // Never -0, which would sort after 0 though it is equal.
-            put: |centroid: usize, dot: i32| {
-                scores[centroid] = (self.base + step * f64::from(dot)) as f32 + 0.0
-            },
+            which: &(0..shard.header.n_centroids).collect::<Vec<_>>(),
         });
-        scores
+        // Never -0, which would sort after 0 though it is equal.
+        products.into_iter().map(|dot| (self.base + step * f64::from(dot)) as f32 + 0.0).collect()
     }
 
     /// Prepares the multipliers of the shard's residual codes and fine residuals.

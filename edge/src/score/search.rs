@@ -33,7 +33,7 @@ pub(super) struct ShardScores {
     pub projections: Vec<Projection>,
     /// `[vectors][centroids]`.
     pub centroids: Vec<Vec<f32>>,
-    /// `[questions][centroids]`: scores minus those of the negatives; empty for questions without negatives.
+    /// `[questions][centroids]`: scores minus those of the negatives.
     pub combined: Vec<Vec<f32>>,
 }
 
@@ -151,14 +151,9 @@ impl ShardScores {
         let projections: Vec<Projection> = vectors.iter().map(project).collect();
         let centroids: Vec<Vec<f32>> =
             projections.iter().map(|of| of.score_centroids(instructions, shard)).collect();
-        let combined = places.iter().map(|places| match &places[..] {
-            [] | [_] => Vec::new(),
-            [own, negatives @ ..] => {
-                let scores = centroids[*own].iter().enumerate();
-                let of =
-                    |(at, own): (usize, &f32)| combine(*own, negatives.iter().map(|n| centroids[*n][at]));
-                scores.map(of).collect()
-            }
+        let combined = places.iter().map(|places| {
+            let own = centroids[places[0]].iter().enumerate();
+            own.map(|(at, own)| combine(*own, places[1..].iter().map(|n| centroids[*n][at]))).collect()
         });
         Self { combined: combined.collect(), projections, centroids }
     }

@@ -35,19 +35,6 @@ impl Kernels for V3 {
         }
         in_order(self, sums)
     }
-
-    #[inline(always)]
-    fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32 {
-        let avx2 = self.avx2;
-        let least = self.avx._mm256_set1_epi16(least as i16);
-        let [low, high]: [__m256i; 2] = cast(*sums);
-        // AVX2 has no unsigned comparison of words; their maximum serves instead.
-        let low = avx2._mm256_cmpeq_epi16(avx2._mm256_max_epu16(low, least), low);
-        let high = avx2._mm256_cmpeq_epi16(avx2._mm256_max_epu16(high, least), high);
-        // Packing works within 128 bits: quarters come out as 0, 2, 1, 3.
-        let bytes = avx2._mm256_permute4x64_epi64::<0b11_01_10_00>(avx2._mm256_packs_epi16(low, high));
-        avx2._mm256_movemask_epi8(bytes) as u32
-    }
 }
 
 impl Kernels for V4 {
@@ -100,12 +87,6 @@ impl Kernels for V4 {
             add_column(*self, &mut sums, codes, low, high);
         }
         in_order(*self, sums)
-    }
-
-    #[inline(always)]
-    fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32 {
-        let least = self.avx512f._mm512_set1_epi16(least as i16);
-        self.avx512bw._mm512_cmpge_epu16_mask(cast(*sums), least)
     }
 }
 
