@@ -106,7 +106,7 @@ pub fn parse() -> Result<Cli, Exit> {
             Ok(cli)
         }
         Err(ConfigError::Line(error)) => error.exit(),
-        Err(error) => Err(Failure::Usage(error.into()).report(false)),
+        Err(error) => Err(Failure::usage(error).report(false)),
     }
 }
 
@@ -197,6 +197,10 @@ mod tests {
         assert_eq!((list.sort, list.format), (ObjectOrder::Area, Some(ListFormat::Csv)));
         command("slag-edge query chair --encoder clip --provider tensorrt,cuda,cpu --model-threads 2");
         command("slag-edge locate a.jpg --focal-px 554.3 --gravity 0,1,0 --cache c --json");
+        command("slag-edge fetch --radius 0 --margin 1e9 --from http://[::1]:7733/store/");
+        // As for questions: a flat box is empty, and no scene is opened.
+        let flat = parse("slag-edge list --box 0,0,1,5,5,1 --cache nowhere").expect("a line");
+        assert_eq!(flat.run(), Exit::Usage);
     }
 
     #[test]
@@ -227,6 +231,20 @@ mod tests {
             "slag-edge trust add --trust-first",
             "slag-edge fetch --margin",
             "slag-edge fetch --profile tiny",
+            // Unreachably long distances would be retried for ever.
+            "slag-edge fetch --watch --radius 1.7e308",
+            "slag-edge fetch --radius 1e10",
+            "slag-edge fetch --margin 1e10",
+            "slag-edge fetch --margin 0",
+            "slag-edge serve --margin -1",
+            "slag-edge serve --radius inf",
+            "slag-edge list --near 0,0,0 --radius 1e10",
+            "slag-edge fetch --at-geo 46.8,-92,1e300",
+            // Wrong stores are refused before anything starts.
+            "slag-edge serve --follow base:7733",
+            "slag-edge fetch --from ftp://x",
+            "slag-edge fetch --from http://a:70000",
+            "slag-edge trust add --trust-first http://a@b",
             "slag-edge serve --listen nowhere",
             "slag-edge status --quiet --verbose",
             "slag-edge serve --threads 0",

@@ -13,7 +13,7 @@ use slag_common::objects::parse_public_id;
 use slag_common::{durable, files};
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
-use super::failure::{Failure, store_failure};
+use super::failure::Failure;
 use super::output::print_json;
 use super::text::{table, visible};
 
@@ -57,11 +57,11 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
         parse_public_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
     let GoalArgs { near, heading_rad, robot, stand, .. } = args;
     let request = GoalRequest { target, near, heading_rad, robot, stand };
-    request.check().map_err(|e| Failure::Usage(e.into()))?;
+    request.check()?;
     args.map.iter().try_for_each(|path| files::check_writable(path))?;
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload().map_err(store_failure)?;
+    engine.reload()?;
     let on_board = engine.on_board()?;
     if let Some(path) = &args.map {
         let map = goal::floor_map(&on_board.snapshot, &request, &Budget::default()).map_err(failure)?;
@@ -77,7 +77,7 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
 fn failure(error: GoalError) -> Failure {
     match error {
         GoalError::Query(error) => error.into(),
-        other => Failure::Failed(other.kind(), other.into()),
+        other => Failure::failed(other.kind(), other),
     }
 }
 

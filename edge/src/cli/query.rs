@@ -15,7 +15,7 @@ use slag_common::frames::Aabb;
 use slag_common::{durable, files, note};
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named};
-use super::failure::{Failure, store_failure};
+use super::failure::Failure;
 use super::text::{table, visible};
 
 const EXAMPLES: &str = "Examples:\n\
@@ -95,11 +95,11 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
         members: args.ply.is_some(),
         ..QueryRequest::new(args.text)
     };
-    request.check().map_err(|e| Failure::Usage(e.into()))?;
+    request.check()?;
     args.ply.iter().try_for_each(|path| files::check_writable(path))?;
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload().map_err(store_failure)?;
+    engine.reload()?;
     let reply = engine.on_board()?.answer(request, &Budget::default())?;
     if let Some(path) = &args.ply {
         write_ply(&reply, path)?;

@@ -118,7 +118,7 @@ async fn serve(
     settings: Settings,
 ) -> Result<(), Failure> {
     let stop = stop_signal()?;
-    let listener = bind(&args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
+    let listener = bind(&args.listen).await.map_err(|e| Failure::failed("listen", e))?;
     let listener = listener.with_tls(tls);
     // For scripts that let the system choose a port.
     let url = listener.url()?;
@@ -171,10 +171,10 @@ fn tls(args: &mut ServeArgs) -> Result<Option<Tls>, Failure> {
         // One of them may come from the configuration.
         _ => {
             let what = anyhow!("TLS needs both --tls-cert and --tls-key; give both, or neither");
-            return Err(Failure::Usage(what));
+            return Err(Failure::usage(what));
         }
     };
-    args.listen.tls(files).map_err(|e| Failure::Usage(e.into()))
+    args.listen.tls(files).map_err(Failure::usage)
 }
 
 /// Returns a cache folder that every user may write to: answers come from files checked only by hash.
@@ -211,9 +211,9 @@ fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
         origins: std::mem::take(&mut args.cors),
         token_file: args.token_file.take(),
     };
-    let access = Access::new(&args.listen, settings).map_err(|e| Failure::Usage(e.into()))?;
+    let access = Access::new(&args.listen, settings).map_err(Failure::usage)?;
     if args.follow.is_some() && !access.takes_writes() {
-        return Err(Failure::Usage(anyhow!(
+        return Err(Failure::usage(anyhow!(
             "--follow needs positions, and on {} everybody could post them; give --token-file FILE, or listen on \
              127.0.0.1 or unix:PATH",
             args.listen

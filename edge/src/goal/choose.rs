@@ -20,8 +20,6 @@ const SQUARE_M: f64 = 0.2;
 const MAX_CANDIDATES: usize = 256;
 /// Most candidates of any square examined if none of those sees the thing, spread over all.
 const MAX_MORE: usize = 2048;
-/// Neighbouring candidates examined in sequence: mostly the same obstacle hides the thing from them.
-const NEIGHBOURS: usize = 64;
 /// Least distance between two poses of a reply, metres.
 const APART_M: f64 = 0.5;
 /// Clearance beyond the robot's radius above which more adds nothing, metres.
@@ -44,13 +42,12 @@ struct Candidate {
 /// Returns the best poses near the thing with a surface at `points`, or why there is none.
 pub fn choose(
     around: &Surroundings<'_>,
-    paths: &mut Paths,
+    paths: &Paths,
     request: &GoalRequest,
     points: &[DVec3],
 ) -> Result<Vec<Goal>, NoGoal> {
     let window = &around.space.window;
     let near = cells_near(window, points, request.stand.reach_m + window.voxel * 0.5f64.sqrt());
-    paths.find(near.iter().copied());
     let candidate = |cell: &usize| {
         let path_m = paths.to(*cell)? * window.voxel;
         let spare_m = (around.clearance_m(*cell) - request.robot.radius_m).clamp(0.0, COMFORT_M);
@@ -63,12 +60,8 @@ pub fn choose(
     }
     let target = Target::new(around, request, points);
     let looked_at = |candidates: Vec<Candidate>| -> Vec<Look> {
-        let of_piece = |piece: &[Candidate]| {
-            let mut hints = [sight::Hint::NONE; SAMPLES];
-            let piece = if around.budget.goes_on() { piece } else { &[] };
-            piece.iter().filter_map(|of| look(around, request, &target, &mut hints, *of)).collect::<Vec<_>>()
-        };
-        candidates.par_chunks(NEIGHBOURS).flat_map_iter(of_piece).collect()
+        let look = |of| around.budget.goes_on().then(|| look(around, request, &target, of)).flatten();
+        candidates.into_par_iter().filter_map(look).collect()
     };
     let mut looks = looked_at(sifted(window, reached.clone()));
     // Over the edge of a table, the thing on it is often seen only from a strip that is narrower than a square.
@@ -183,12 +176,11 @@ struct Look {
     cost_m: f64,
 }
 
-/// Looks at the thing from a candidate; `None` if the thing is out of reach after all. `hints`: by sample.
+/// Looks at the thing from a candidate; `None` if the thing is out of reach after all.
 fn look(
     around: &Surroundings<'_>,
     request: &GoalRequest,
     target: &Target<'_>,
-    hints: &mut [sight::Hint; SAMPLES],
     of: Candidate,
 ) -> Option<Look> {
     let [x, y] = around.space.window.centre_of(of.cell);
@@ -200,8 +192,8 @@ fn look(
     let sensor_in_world = position_in_world + DVec3::Z * request.robot.sensor_height_m;
     let voxel = around.space.window.voxel_of(sensor_in_world);
     let mut seen = 0u128;
-    for ((bit, point), hint) in (0..).zip(&target.samples).zip(hints) {
-        seen |= u128::from(sight::sees(&target.thing, sensor_in_world, voxel, *point, hint)) << bit;
+    for (bit, point) in (0..).zip(&target.samples) {
+        seen |= u128::from(sight::sees(&target.thing, sensor_in_world, voxel, *point)) << bit;
     }
     let visible_share = f64::from(seen.count_ones()) / target.samples.len() as f64;
     let cost_m = of.cost_m + SIGHT_WEIGHT_M * (1.0 - visible_share);

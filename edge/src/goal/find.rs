@@ -42,14 +42,14 @@ pub fn find(on_board: &OnBoard, request: &GoalRequest, budget: &Budget) -> Resul
         reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });
         return Ok(reply);
     };
-    let (mut paths, scene) = (seen.paths_from(start), Scene::of(snapshot));
+    let (paths, scene) = (seen.paths_from(start), Scene::of(snapshot));
     for (shape, thing) in things {
         let points = match shape {
             Shape::Object(id) => scene.object_points(id, MAX_POINTS, budget),
             Shape::Group(group) => scene.answer_points(&group, MAX_POINTS, budget),
         };
         budget.check()?;
-        let chosen = choose(&seen, &mut paths, request, &points);
+        let chosen = choose(&seen, &paths, request, &points);
         // Looks end early once the budget is spent.
         budget.check()?;
         match chosen {

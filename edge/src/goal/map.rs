@@ -27,11 +27,7 @@ pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) ->
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
     let seen = Surroundings::look(snapshot, request, near, budget)?;
     let start = seen.start(near, request.robot.radius_m);
-    let paths = start.map(|start| {
-        let mut paths = seen.paths_from(start);
-        paths.find(0..seen.is_safe.len());
-        paths
-    });
+    let paths = start.map(|start| seen.paths_from(start));
     budget.check()?;
     let window = &seen.space.window;
     let [n_x, n_y] = window.cells();

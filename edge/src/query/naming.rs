@@ -21,7 +21,7 @@ impl Engine {
         wait: Duration,
         budget: &Budget,
     ) -> Result<Option<&'a Names>, QueryError> {
-        if let Some(names) = on_board.listed.names.get() {
+        if let Some(names) = on_board.names.get() {
             return Ok(Some(names));
         }
         if on_board.check().is_err() {
@@ -32,7 +32,7 @@ impl Engine {
         let made = Names::new(words, &Scene::of(&on_board.snapshot), budget);
         budget.give_back_to(used_bytes, 0);
         let made = made?;
-        Ok(Some(on_board.listed.names.get_or_init(|| made)))
+        Ok(Some(on_board.names.get_or_init(|| made)))
     }
 
     pub(crate) fn begin_names(&self) {

@@ -16,7 +16,6 @@ use slag_service::problem::Problem;
 use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, ObjectIdText, XyzText};
-use crate::http::problem::query_problem;
 use crate::query::{OnBoard, RequestError, Words};
 use crate::score::Budget;
 
@@ -87,7 +86,7 @@ async fn answer<T: Send + 'static>(
     let near = forms::point(place.near, place.near_lat_lon)?;
     request.check()?;
     let answering = app.within_limits(None, move |app, budget| {
-        let on_board = app.engine.on_board().map_err(query_problem)?;
+        let on_board = app.engine.on_board()?;
         let manifest = &on_board.snapshot.manifest;
         request.near = match near {
             Some(near) => Some(near.in_world("near", manifest)?),
@@ -101,7 +100,7 @@ async fn answer<T: Send + 'static>(
 fn problem(error: GoalError) -> Problem {
     let kind = error.kind();
     match error {
-        GoalError::Query(error) => query_problem(error),
+        GoalError::Query(error) => error.into(),
         error => Problem::new(StatusCode::CONFLICT, kind, "No places known", error.to_string()),
     }
 }

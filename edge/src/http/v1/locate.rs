@@ -14,7 +14,6 @@ use slag_service::problem::Problem;
 
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, XyText, XyzText};
-use crate::http::problem::{query_problem, spent};
 use crate::locate::{Answer, Camera, LocateError, PhotoFile, answer, map_working_bytes};
 use crate::query::{Point, RequestError};
 use crate::score::MAX_COORDINATE;
@@ -79,16 +78,16 @@ pub async fn locate(
 ) -> Result<Json<Answer>, Problem> {
     let (mut camera, near) = params.camera()?;
     app.within_limits(None, move |app, budget| {
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        let snapshot = app.engine.snapshot()?;
         if let Some((near, sigma)) = near {
             let position_in_world = near.in_world("near", &snapshot.manifest)?;
             camera.prior = Some(Prior { position_in_world, sigma });
         }
         budget.take(PhotoFile::opening_bytes(&photo));
-        budget.check().map_err(spent)?;
+        budget.check()?;
         let opened = PhotoFile::open(&photo).map_err(problem)?;
         budget.take(opened.working_bytes() + map_working_bytes(&snapshot));
-        budget.check().map_err(spent)?;
+        budget.check()?;
         answer(&snapshot, opened, &camera, budget).map(Json).map_err(problem)
     })
     .await
