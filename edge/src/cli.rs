@@ -205,57 +205,25 @@ mod tests {
 
     #[test]
     fn wrong_lines_are_refused() {
-        for line in [
-            "slag-edge",
-            "slag-edge query",
-            "slag-edge query chair --radius 4",
-            "slag-edge query chair --near 1,2",
-            "slag-edge query chair --near NaN,0,0",
-            "slag-edge query chair --kind points",
-            "slag-edge query chair --limit -1",
-            "slag-edge query chair --box 1,2,3",
-            "slag-edge query chair --negatives ,",
-            "slag-edge goal",
-            "slag-edge list --near 1,2,3",
-            "slag-edge list --radius 3",
-            "slag-edge list --sort size",
-            "slag-edge list --format csv --json",
-            "slag-edge locate a.jpg",
-            "slag-edge locate a.jpg --focal-px 0",
-            "slag-edge changes --from first",
-            "slag-edge goal chair --near 1,2",
-            "slag-edge fetch --at 1,2,3 --at-geo 1,2",
-            "slag-edge fetch --at-geo 91,0",
-            "slag-edge trust add http://a",
-            "slag-edge trust add http://a --trust-first --root f",
-            "slag-edge trust add --trust-first",
-            "slag-edge fetch --margin",
-            "slag-edge fetch --profile tiny",
-            // Unreachably long distances would be retried for ever.
-            "slag-edge fetch --watch --radius 1.7e308",
-            "slag-edge fetch --radius 1e10",
-            "slag-edge fetch --margin 1e10",
-            "slag-edge fetch --margin 0",
-            "slag-edge serve --margin -1",
-            "slag-edge serve --radius inf",
-            "slag-edge list --near 0,0,0 --radius 1e10",
-            "slag-edge fetch --at-geo 46.8,-92,1e300",
-            // Wrong stores are refused before anything starts.
-            "slag-edge serve --follow base:7733",
-            "slag-edge fetch --from ftp://x",
-            "slag-edge fetch --from http://a:70000",
-            "slag-edge trust add --trust-first http://a@b",
-            "slag-edge serve --listen nowhere",
-            "slag-edge status --quiet --verbose",
-            "slag-edge serve --threads 0",
-            "slag-edge serve --threads 257",
-            "slag-edge query chair --threads 100000",
-            "slag-edge query chair --model-threads 257",
-            "slag-edge query chair --provider gpu",
-            "slag-edge models",
-            "slag-edge models pull",
-        ] {
-            assert_eq!(parse(line).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
+        let wrong = "; query; query chair --radius 4; query chair --near 1,2; query chair --near NaN,0,0; \
+            query chair --kind points; query chair --limit -1; query chair --box 1,2,3; \
+            query chair --negatives ,; goal; list --near 1,2,3; list --radius 3; list --sort size; \
+            list --format csv --json; locate a.jpg; locate a.jpg --focal-px 0; changes --from first; \
+            goal chair --near 1,2; fetch --at 1,2,3 --at-geo 1,2; fetch --at-geo 91,0; \
+            trust add http://a; trust add http://a --trust-first --root f; trust add --trust-first; \
+            fetch --margin; fetch --profile tiny";
+        // Unreachably long distances would be retried for ever.
+        let far = "fetch --watch --radius 1.7e308; fetch --radius 1e10; fetch --margin 1e10; \
+            fetch --margin 0; serve --margin -1; serve --radius inf; list --near 0,0,0 --radius 1e10; \
+            fetch --at-geo 46.8,-92,1e300";
+        // Wrong stores are refused before anything starts.
+        let stores = "serve --follow base:7733; fetch --from ftp://x; fetch --from http://a:70000; \
+            trust add --trust-first http://a@b; serve --listen nowhere; status --quiet --verbose; \
+            serve --threads 0; serve --threads 257; query chair --threads 100000; \
+            query chair --model-threads 257; query chair --provider gpu; models; models pull";
+        for line in [wrong, far, stores].iter().flat_map(|lines| lines.split("; ")) {
+            let line = &format!("slag-edge {line}");
+            assert_eq!(parse(line.trim_end()).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
         }
     }
 }

@@ -229,20 +229,10 @@ fn a_robot_is_followed_along_stdin() {
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(red_and_blue());
     let watch = |text: &str| {
-        let args = [
-            "fetch",
-            "--trust-first",
-            "--watch",
-            "--from",
-            &from,
-            "--radius",
-            "20",
-            "--margin",
-            "4",
-            "--min-interval-secs",
-            "0",
-        ];
-        let mut child = slag_edge(dir.path(), &[&args[..], &["--json"]].concat());
+        let args = format!(
+            "fetch --trust-first --watch --from {from} --radius 20 --margin 4 --min-interval-secs 0 --json"
+        );
+        let mut child = slag_edge(dir.path(), &args.split(' ').collect::<Vec<_>>());
         child.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = child.spawn().expect("runs");
         child.stdin.take().expect("a pipe").write_all(text.as_bytes()).expect("written");
