@@ -1,7 +1,8 @@
 //! `query`.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::Arc;
 
 use crate::query::{
     AnswerKind, Answers, ClusterAnswer, DEFAULT_MIN_COUNT, Format, Found, GaussianAnswer, Negatives,
@@ -100,26 +101,22 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload()?;
-    let reply = engine.on_board()?.answer(request, &Budget::default())?;
+    let reply = Arc::new(engine.on_board()?.answer(request, &Budget::default())?);
     if let Some(path) = &args.ply {
-        write_ply(&reply, path)?;
+        durable::write_result(path, |file| write(Arc::clone(&reply), Format::Ply, file))?;
     }
     match args.json {
-        true => write_json(reply),
+        true => {
+            let mut out = io::stdout().lock();
+            write(reply, Format::Json, &mut out)?;
+            Ok(writeln!(out)?)
+        }
         false => reply.answers.iter().try_for_each(|answers| print_answers(&reply, answers)),
     }
 }
 
-fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
-    durable::write_result(path, |file| reply.ply().try_for_each(|piece| Ok(file.write_all(&piece?)?)))
-}
-
-fn write_json(reply: Reply) -> Result<(), Failure> {
-    let mut out = io::stdout().lock();
-    for piece in reply.pieces(Format::Json) {
-        out.write_all(&piece?)?;
-    }
-    Ok(writeln!(out)?)
+fn write(reply: Arc<Reply>, format: Format, mut to: impl Write) -> io::Result<()> {
+    reply.pieces(format).try_for_each(|piece| to.write_all(&piece?))
 }
 
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {

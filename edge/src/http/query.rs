@@ -104,7 +104,7 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
         let Some(format) = format else {
             return Ok((serde_json::to_vec(&Page::of(&reply)).map_err(Problem::internal)?, None));
         };
-        let mut pieces = reply.pieces(format).peekable();
+        let mut pieces = Arc::new(reply).pieces(format).peekable();
         let first = pieces.next().transpose().map_err(Problem::internal)?.unwrap_or_default();
         let is_whole = pieces.peek().is_none();
         // The answers' bytes stay charged until they are sent.

@@ -386,6 +386,7 @@ fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer
     }
 }
 
+/// Describes an object as the cluster of its Gaussians in a region.
 fn object_answer(
     scene: &Scene<'_>,
     ranked: Ranked<FoundObject<'_>>,
@@ -395,29 +396,24 @@ fn object_answer(
 ) -> ClusterAnswer {
     let Ranked { found, rank, relevance, distance } = ranked;
     let FoundObject { object, record, n_gaussians, cut, .. } = found;
-    let manifest = scene.manifest;
-    let Extent { position_in_world, box_in_world } = found.extent();
+    let cluster = Cluster {
+        first: (0, 0),
+        n_gaussians,
+        score,
+        best_score: score,
+        extent: found.extent(),
+        oriented_box: objects::oriented_box(scene, &found, region, alignment(scene.manifest)),
+        members: if with_members { objects::members(scene, object, region, score) } else { Vec::new() },
+    };
     let whole = cut.map(|_| {
         let (position_in_world, bounds) = (record.position(), record.bounds());
         Whole { position_in_world, box_min_in_world: bounds.min, box_max_in_world: bounds.max }
     });
     ClusterAnswer {
-        rank,
         id: found.public_id(),
-        position_in_world,
-        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
-        box_min_in_world: box_in_world.min,
-        box_max_in_world: box_in_world.max,
-        size: box_in_world.size(),
-        oriented_box: objects::oriented_box(scene, &found, region, alignment(manifest)),
-        score,
-        best_score: score,
-        n_gaussians,
         n_gaussians_in_scene: Some(u64::from(record.n_gaussians)),
         whole,
         evidence: Some(objects::evidence(scene, object)),
-        relevance,
-        distance,
-        members: if with_members { objects::members(scene, object, region, score) } else { Vec::new() },
+        ..cluster_answer(Ranked { found: cluster, rank, relevance, distance }, scene.manifest)
     }
 }

@@ -22,12 +22,13 @@ use arrow_schema::{ArrowError, DataType, Field, Schema};
 
 use super::answers::Found;
 use super::reply::Reply;
+use crate::score::Hit;
 
 /// Rows per batch: half a megabyte.
 const BATCH_ROWS: usize = 16 << 10;
 
 pub struct Pieces {
-    reply: Reply,
+    reply: Arc<Reply>,
     schema: Arc<Schema>,
     writer: Option<StreamWriter<Vec<u8>>>,
     question: usize,
@@ -36,7 +37,7 @@ pub struct Pieces {
 }
 
 impl Pieces {
-    pub fn new(reply: Reply) -> Self {
+    pub fn new(reply: Arc<Reply>) -> Self {
         let schema = Arc::new(schema(&reply));
         Self { reply, schema, writer: None, question: 0, item: 0, is_closed: false }
     }
@@ -59,7 +60,7 @@ impl Pieces {
         match gaussians(self.question) {
             Some(hits) => {
                 let end = hits.len().min(self.item + BATCH_ROWS);
-                writer.write(&batch(&self.reply, &self.schema, self.question, self.item..end)?)?;
+                writer.write(&batch(&self.reply, &self.schema, self.question, &hits[self.item..end])?)?;
                 self.item = end;
             }
             None => {
@@ -121,14 +122,10 @@ fn batch(
     reply: &Reply,
     schema: &Arc<Schema>,
     question: usize,
-    items: std::ops::Range<usize>,
+    hits: &[Hit],
 ) -> Result<RecordBatch, ArrowError> {
-    let hits = match reply.answers.get(question).map(|answers| &answers.answers) {
-        Some(Found::Gaussians(hits)) => &hits[items],
-        _ => &[],
-    };
     let views: Vec<_> = reply.snapshot.shards.iter().map(|shard| shard.view()).collect();
-    let shard = |hit: &crate::score::Hit| &views[hit.shard as usize];
+    let shard = |hit: &Hit| &views[hit.shard as usize];
     let positions: Vec<_> = hits.iter().map(|hit| shard(hit).position_in_world(hit.index as usize)).collect();
     let along = |axis: usize| {
         Arc::new(Float64Array::from_iter_values(positions.iter().map(|position| position[axis])))

@@ -42,7 +42,6 @@ pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder};
 pub use listing::ListFormat;
 pub(crate) use naming::NAMES_WAIT;
 pub use page::Page;
-pub use rank::relevance;
 pub use reason::{Reason, ReasonKind};
 pub use reply::Reply;
 pub use request::{
