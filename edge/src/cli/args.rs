@@ -100,6 +100,27 @@ pub struct ModelArgs {
     pub how: RunArgs,
 }
 
+/// What answers questions: the shards on board and a text model.
+#[derive(Debug, Args)]
+pub struct EngineArgs {
+    #[command(flatten)]
+    pub threads: ThreadArgs,
+    #[command(flatten)]
+    pub cache: CacheArgs,
+    #[command(flatten)]
+    pub models: ModelArgs,
+}
+
+impl EngineArgs {
+    /// Opens what is on board.
+    pub fn open(self) -> Result<Engine, Failure> {
+        self.threads.apply()?;
+        let engine = engine(self.cache.open()?, &self.models)?;
+        engine.reload()?;
+        Ok(engine)
+    }
+}
+
 /// Makes an engine from a cache and a text model; without one given, scenes' own models are used.
 pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
     let (given, options) = text_model(models)?;

@@ -12,7 +12,7 @@ use slag_api::goal::{Goal, GoalReply, MissedThing, NoGoal};
 use slag_common::objects::parse_public_id;
 use slag_common::{durable, files};
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
+use super::args::EngineArgs;
 use super::failure::Failure;
 use super::output::print_json;
 use super::text::{table, visible};
@@ -42,11 +42,7 @@ pub struct GoalArgs {
     #[arg(long, value_name = "FILE.pgm")]
     pub map: Option<PathBuf>,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
     /// Print the poses as JSON.
     #[arg(long)]
     pub json: bool,
@@ -59,9 +55,7 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let request = GoalRequest { target, near, heading_rad, robot, stand };
     request.check()?;
     args.map.iter().try_for_each(|path| files::check_writable(path))?;
-    args.threads.apply()?;
-    let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload()?;
+    let engine = args.engine.open()?;
     let on_board = engine.on_board()?;
     if let Some(path) = &args.map {
         let map = goal::floor_map(&on_board.snapshot, &request, &Budget::default()).map_err(failure)?;

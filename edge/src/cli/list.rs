@@ -10,7 +10,7 @@ use slag_api::objects::{Name, ObjectOnBoard, ObjectPage};
 use slag_common::frames::Aabb;
 use slag_common::note;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named, parse_radius, parse_reach};
+use super::args::{EngineArgs, named, parse_radius, parse_reach};
 use super::failure::Failure;
 use super::text::{table, visible};
 use crate::query::{ListFormat, ObjectFilter, ObjectOrder, check_region, parse_box, parse_point};
@@ -55,11 +55,7 @@ pub struct ListArgs {
     #[arg(long, conflicts_with = "format")]
     pub json: bool,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
 }
 
 pub fn run(args: ListArgs) -> Result<(), Failure> {
@@ -68,9 +64,7 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
     let region = Region { ball, bounds: args.bounds, polygon: None };
     check_region(&region)?;
     let filter = ObjectFilter { after: None, region, min_size: args.min_size, order: args.sort };
-    args.threads.apply()?;
-    let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload()?;
+    let engine = args.engine.open()?;
     let on_board = engine.on_board()?;
     let format = if args.json { Some(ListFormat::Json) } else { args.format };
     format.unwrap_or_default().check(&on_board.snapshot.manifest)?;

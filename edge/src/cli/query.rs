@@ -15,7 +15,7 @@ use slag_api::coverage::BadCellAnswer;
 use slag_common::frames::Aabb;
 use slag_common::{durable, files, note};
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named};
+use super::args::{EngineArgs, named};
 use super::failure::Failure;
 use super::text::{table, visible};
 
@@ -65,11 +65,7 @@ pub struct QueryArgs {
     #[arg(long, value_name = "NAME", default_value_t = Precision::Exact)]
     pub precision: Precision,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
     /// Write the Gaussians that answered to a PLY of points: position, score, rank of their answer, and index in
     /// the input splat file where the shards know it.
     #[arg(long, value_name = "FILE")]
@@ -98,9 +94,7 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
     };
     request.check()?;
     args.ply.iter().try_for_each(|path| files::check_writable(path))?;
-    args.threads.apply()?;
-    let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload()?;
+    let engine = args.engine.open()?;
     let reply = Arc::new(engine.on_board()?.answer(request, &Budget::default())?);
     if let Some(path) = &args.ply {
         durable::write_result(path, |file| write(Arc::clone(&reply), Format::Ply, file))?;

@@ -15,7 +15,7 @@ use slag_service::listen::{Listen, answers, bind};
 use slag_service::stop::stop_signal;
 use slag_service::tls::{Tls, TlsFiles};
 
-use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, parse_bytes};
+use super::args::{CacheArgs, DownloadArgs, EngineArgs, engine, parse_bytes};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
 use super::network::parse_store;
@@ -74,18 +74,14 @@ pub struct ServeArgs {
     #[command(flatten)]
     pub following: FollowArgs,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
 }
 
 pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
-    args.threads.apply()?;
+    args.engine.threads.apply()?;
     let access = access(&mut args)?;
     let tls = tls(&mut args)?;
-    let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
+    let cache = std::mem::replace(&mut args.engine.cache, CacheArgs { cache: None }).open()?;
     if let Some(path) = open_to_everybody(&cache) {
         tracing::warn!(
             "everybody on this machine may write to {path}, and so decide what this robot answers until its next \
@@ -93,7 +89,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
             path = path.display()
         );
     }
-    let engine = engine(cache.clone(), &args.models)?;
+    let engine = engine(cache.clone(), &args.engine.models)?;
     load(&engine);
     let query_timeout = Duration::from_secs(args.max_query_secs);
     let settings = Settings { access, ..Settings::with_budget(args.max_query_bytes, query_timeout) };

@@ -1,6 +1,6 @@
 //! Query engine: a cache and a text model, shared by the HTTP service and the command line.
 
-use std::path::PathBuf;
+use std::io;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
@@ -120,14 +120,6 @@ impl OnBoard {
     }
 }
 
-/// Opens the text model that a scene carries; failure is logged.
-fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
-    open_text_model(cache, manifest, options).unwrap_or_else(|error| {
-        tracing::warn!("the scene's text model does not open: {}", crate::error_line(&error));
-        None
-    })
-}
-
 /// Answers questions from the newest generation of a cache.
 pub struct Engine {
     cache: EdgeCache,
@@ -228,45 +220,35 @@ impl Engine {
 /// Longest description read; those of public models take two thousand bytes.
 const MAX_DESCRIPTION_BYTES: u64 = 1 << 20;
 
-#[derive(Debug, thiserror::Error)]
-pub enum CarriedError {
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    #[error("{path}: {cause}; fetch again, which replaces what is damaged", path = path.display())]
-    Open { path: PathBuf, cause: Box<TextOpenError> },
-}
-
-/// Opens the text model that a scene carries; `None` if it carries none.
-fn open_text_model(
-    cache: &EdgeCache,
-    manifest: &Manifest,
-    options: &SessionOptions,
-) -> Result<Option<TextService>, CarriedError> {
-    let Some(record) = &manifest.encoder.text_model else { return Ok(None) };
+/// Opens the text model that a scene carries, if it does; failure is logged.
+fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
+    let record = manifest.encoder.text_model.as_ref()?;
     let expected = record.description.hash;
     let path = cache.shard_path(expected);
-    let mark = || mark_damaged(cache, record);
-    let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
-    let bytes = read.inspect_err(|e| {
-        if e.is_damage() {
-            mark()
+    let failed = |is_damaged: bool, error: &(dyn std::error::Error + 'static)| {
+        if is_damaged {
+            mark_damaged(cache, record);
         }
-    })?;
+        tracing::warn!("the scene's text model does not open: {}", crate::error_line(error));
+    };
+    let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
+    let bytes = read.inspect_err(|e| failed(e.is_damage(), e)).ok()?;
     let found = Hash32::of(&bytes);
     if found != expected {
-        mark();
-        return Err(StoreError::Hash { path, expected, found }.into());
+        failed(true, &StoreError::Hash { path, expected, found });
+        return None;
     }
     let folder = path.parent().unwrap_or(cache.dir());
     let opened = ModelDir::carried(&bytes, &path, folder)
         .map_err(TextOpenError::Model)
         .and_then(|models| TextService::open(&models, options));
-    opened.map(Some).map_err(|cause| {
-        if matches!(cause, TextOpenError::Model(_)) {
-            mark();
-        }
-        CarriedError::Open { path, cause: Box::new(cause) }
-    })
+    let advice = |cause: TextOpenError| {
+        let is_damaged = matches!(cause, TextOpenError::Model(_));
+        let (path, cause) = (path.display(), crate::error_line(&cause));
+        let told = format!("{path}: {cause}; fetch again, which replaces what is damaged");
+        failed(is_damaged, &io::Error::other(told));
+    };
+    opened.map_err(advice).ok()
 }
 
 /// Marks the files that differ from the record; the next fetch downloads them again.
