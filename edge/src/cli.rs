@@ -106,7 +106,7 @@ pub fn parse() -> Result<Cli, Exit> {
             Ok(cli)
         }
         Err(ConfigError::Line(error)) => error.exit(),
-        Err(error) => Err(Failure::Usage(error.into()).report(false)),
+        Err(error) => Err(Failure::usage(error).report(false)),
     }
 }
 
@@ -197,47 +197,33 @@ mod tests {
         assert_eq!((list.sort, list.format), (ObjectOrder::Area, Some(ListFormat::Csv)));
         command("slag-edge query chair --encoder clip --provider tensorrt,cuda,cpu --model-threads 2");
         command("slag-edge locate a.jpg --focal-px 554.3 --gravity 0,1,0 --cache c --json");
+        command("slag-edge fetch --radius 0 --margin 1e9 --from http://[::1]:7733/store/");
+        // As for questions: a flat box is empty, and no scene is opened.
+        let flat = parse("slag-edge list --box 0,0,1,5,5,1 --cache nowhere").expect("a line");
+        assert_eq!(flat.run(), Exit::Usage);
     }
 
     #[test]
     fn wrong_lines_are_refused() {
-        for line in [
-            "slag-edge",
-            "slag-edge query",
-            "slag-edge query chair --radius 4",
-            "slag-edge query chair --near 1,2",
-            "slag-edge query chair --near NaN,0,0",
-            "slag-edge query chair --kind points",
-            "slag-edge query chair --limit -1",
-            "slag-edge query chair --box 1,2,3",
-            "slag-edge query chair --negatives ,",
-            "slag-edge goal",
-            "slag-edge list --near 1,2,3",
-            "slag-edge list --radius 3",
-            "slag-edge list --sort size",
-            "slag-edge list --format csv --json",
-            "slag-edge locate a.jpg",
-            "slag-edge locate a.jpg --focal-px 0",
-            "slag-edge changes --from first",
-            "slag-edge goal chair --near 1,2",
-            "slag-edge fetch --at 1,2,3 --at-geo 1,2",
-            "slag-edge fetch --at-geo 91,0",
-            "slag-edge trust add http://a",
-            "slag-edge trust add http://a --trust-first --root f",
-            "slag-edge trust add --trust-first",
-            "slag-edge fetch --margin",
-            "slag-edge fetch --profile tiny",
-            "slag-edge serve --listen nowhere",
-            "slag-edge status --quiet --verbose",
-            "slag-edge serve --threads 0",
-            "slag-edge serve --threads 257",
-            "slag-edge query chair --threads 100000",
-            "slag-edge query chair --model-threads 257",
-            "slag-edge query chair --provider gpu",
-            "slag-edge models",
-            "slag-edge models pull",
-        ] {
-            assert_eq!(parse(line).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
+        let wrong = "; query; query chair --radius 4; query chair --near 1,2; query chair --near NaN,0,0; \
+            query chair --kind points; query chair --limit -1; query chair --box 1,2,3; \
+            query chair --negatives ,; goal; list --near 1,2,3; list --radius 3; list --sort size; \
+            list --format csv --json; locate a.jpg; locate a.jpg --focal-px 0; changes --from first; \
+            goal chair --near 1,2; fetch --at 1,2,3 --at-geo 1,2; fetch --at-geo 91,0; \
+            trust add http://a; trust add http://a --trust-first --root f; trust add --trust-first; \
+            fetch --margin; fetch --profile tiny";
+        // Unreachably long distances would be retried for ever.
+        let far = "fetch --watch --radius 1.7e308; fetch --radius 1e10; fetch --margin 1e10; \
+            fetch --margin 0; serve --margin -1; serve --radius inf; list --near 0,0,0 --radius 1e10; \
+            fetch --at-geo 46.8,-92,1e300";
+        // Wrong stores are refused before anything starts.
+        let stores = "serve --follow base:7733; fetch --from ftp://x; fetch --from http://a:70000; \
+            trust add --trust-first http://a@b; serve --listen nowhere; status --quiet --verbose; \
+            serve --threads 0; serve --threads 257; query chair --threads 100000; \
+            query chair --model-threads 257; query chair --provider gpu; models; models pull";
+        for line in [wrong, far, stores].iter().flat_map(|lines| lines.split("; ")) {
+            let line = &format!("slag-edge {line}");
+            assert_eq!(parse(line.trim_end()).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
         }
     }
 }

@@ -287,17 +287,6 @@ mod tests {
         assert!(service.encode("wait").is_ok());
     }
 
-    #[test]
-    fn built_in_models_open() {
-        let options = SessionOptions::new("no-runtime-needed".into());
-        let built_in = TextService::open(&ModelDir::colours(), &options).expect("built in");
-        assert_eq!(built_in.encode("a red thing").expect("known").len(), built_in.info().dim as usize);
-        assert!(matches!(
-            built_in.encode("sofa"),
-            Err(TextError::Encode(InferenceError::UnknownWords { .. }))
-        ));
-    }
-
     #[needs_shared]
     #[test]
     fn described_phrase_lists_open() {
@@ -347,14 +336,5 @@ mod tests {
         assert!(!service.is_alive());
         opens.send(true).expect("listens");
         assert!(service.encode("1").is_ok() && service.is_alive());
-    }
-
-    /// A model that panics stops the service; later calls fail at once.
-    #[test]
-    fn a_dead_model_is_an_error() {
-        let service = TextService::start(Axes::info(2), Box::new(Axes::new(2))).expect("a thread");
-        assert!(matches!(service.encode("panic"), Err(TextError::Stopped)));
-        assert!(matches!(service.encode("1"), Err(TextError::Stopped)));
-        assert!(!service.is_alive());
     }
 }

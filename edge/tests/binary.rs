@@ -113,6 +113,12 @@ fn json(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|e| panic!("{e}: {text}"))
 }
 
+/// Runs a line with `--json`; returns its exit code, and a member of what it prints.
+fn told(cache: &Path, line: &str, member: &str) -> (Option<i32>, Value) {
+    let (code, out, _) = run(cache, &[&line.split(' ').collect::<Vec<_>>()[..], &["--json"]].concat());
+    (code, json(&out).pointer(member).cloned().unwrap_or_default())
+}
+
 fn get(url: &str) -> (u16, Value) {
     let agent: ureq::Agent = ureq::Agent::config_builder().http_status_as_error(false).build().into();
     let mut response = agent.get(url).call().expect("an answer");
@@ -125,36 +131,30 @@ fn a_robot_fetches_asks_and_serves() {
     let dir = tempfile::tempdir().expect("a folder");
     let cache = dir.path().join("cache");
 
-    let (code, out, _) = run(&cache, &["query", "red", "--json"]);
-    assert_eq!((code, &json(&out)["error"]["kind"]), (Some(1), &"no-scene".into()));
+    let failed = |kind: &str| (Some(1), Value::from(kind));
+    assert_eq!(told(&cache, "query red", "/error/kind"), failed("no-scene"));
     let (code, out, err) = run(
         &cache,
         &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--radius", "20", "--json"],
     );
     assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
     assert_eq!(json(&out)["downloaded"]["n_shards"], 1);
-    let (code, out, _) = run(&cache, &["status", "--json"]);
-    assert_eq!(
-        (code, &json(&out)["n_gaussians"], &json(&out)["generation"]),
-        (Some(0), &100.into(), &3.into())
-    );
+    assert_eq!(told(&cache, "status", "/n_gaussians"), (Some(0), 100.into()));
+    assert_eq!(told(&cache, "status", "/generation").1, 3);
 
     let (code, out, _) = run(&cache, &["query", "a red thing", "--near", "-1,0,0", "--json"]);
     let answer = &json(&out)["answers"][0];
     assert_eq!((code, &answer["n_gaussians"]), (Some(0), &40.into()));
     assert!((answer["distance"].as_f64().expect("a number") - 3.0195).abs() < 1e-9);
-    let (code, out, err) = run(&cache, &["query", "blue"]);
-    assert!(
-        code == Some(0) && out.contains("8.03, 0.00, 0.00") && err.contains("60 Gaussians of 100"),
-        "{out}{err}"
-    );
-    let (code, out, err) = run(&cache, &["query", "yellow"]);
-    assert!(
-        code == Some(0) && out.is_empty() && err.contains("no Gaussian of the 100 searched"),
-        "{out}{err}"
-    );
-    let (code, out, _) = run(&cache, &["query", "sofa", "--json"]);
-    assert_eq!((code, &json(&out)["error"]["kind"]), (Some(1), &"unknown-words".into()));
+    for (colour, at, note) in [
+        ("blue", "8.03, 0.00, 0.00", "60 Gaussians of 100"),
+        ("yellow", "", "no Gaussian of the 100 searched"),
+    ] {
+        let (code, out, err) = run(&cache, &["query", colour]);
+        assert!(code == Some(0) && out.contains(at) && err.contains(note), "{out}{err}");
+        assert_eq!(out.is_empty(), at.is_empty(), "{out}");
+    }
+    assert_eq!(told(&cache, "query sofa", "/error/kind"), failed("unknown-words"));
     assert_eq!(run(&cache, &["query", " "]).0, Some(2));
     assert_eq!(run(&cache, &["query", "red", "--limit", "0"]).0, Some(2));
     assert_eq!(run(&cache, &["list", "--limit", "0"]).0, Some(2));
@@ -229,20 +229,10 @@ fn a_robot_is_followed_along_stdin() {
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(red_and_blue());
     let watch = |text: &str| {
-        let args = [
-            "fetch",
-            "--trust-first",
-            "--watch",
-            "--from",
-            &from,
-            "--radius",
-            "20",
-            "--margin",
-            "4",
-            "--min-interval-secs",
-            "0",
-        ];
-        let mut child = slag_edge(dir.path(), &[&args[..], &["--json"]].concat());
+        let args = format!(
+            "fetch --trust-first --watch --from {from} --radius 20 --margin 4 --min-interval-secs 0 --json"
+        );
+        let mut child = slag_edge(dir.path(), &args.split(' ').collect::<Vec<_>>());
         child.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = child.spawn().expect("runs");
         child.stdin.take().expect("a pipe").write_all(text.as_bytes()).expect("written");
@@ -310,8 +300,8 @@ fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
     let dir = tempfile::tempdir().expect("a folder");
     let path = dir.path().join("shards").join(Hash32::of(&shard).to_string());
     let from = store((listed, shard));
-    let fetch = ["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--json"];
-    assert_eq!(run(dir.path(), &fetch).0, Some(0));
+    let fetch = format!("fetch --trust-first --from {from} --at 0,0,0");
+    assert_eq!(told(dir.path(), &fetch, "").0, Some(0));
     let (mut serving, url) = serve(dir.path(), &[]);
     assert_eq!(get(&format!("{url}/query?text=blue")).0, 200);
     fs_err::OpenOptions::new().write(true).open(&path).expect("on board").set_len(0).expect("cut");
@@ -319,8 +309,7 @@ fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
     assert_eq!(serving.wait().expect("ends").signal(), Some(SIGBUS));
     let (code, out, err) = run(dir.path(), &["query", "blue", "--json"]);
     assert_eq!(code, Some(1), "{out}{err}");
-    let (code, out, err) = run(dir.path(), &fetch);
-    assert_eq!((code, &json(&out)["downloaded"]["n_shards"]), (Some(0), &1.into()), "{out}{err}");
+    assert_eq!(told(dir.path(), &fetch, "/downloaded/n_shards"), (Some(0), 1.into()));
     assert_eq!(run(dir.path(), &["query", "blue"]).0, Some(0));
 }
 
@@ -333,14 +322,13 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
     let (listed, shard) = painted(&[[5000; 3]; 4000], 2000);
     let path = disk.path().join("shards").join(Hash32::of(&shard).to_string());
     let from = store((listed, shard));
-    let fetch = ["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--json"];
-    assert_eq!(run(disk.path(), &fetch).0, Some(0));
+    let fetch = format!("fetch --trust-first --from {from} --at 0,0,0");
+    assert_eq!(told(disk.path(), &fetch, "").0, Some(0));
     disk.break_block(&path, 15);
     let (serving, url) = serve(disk.path(), &[]);
     assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
     assert!(stop(serving).contains("cannot be read"));
-    let (code, out, err) = run(disk.path(), &fetch);
-    assert_eq!((code, &json(&out)["downloaded"]["n_shards"]), (Some(0), &1.into()), "{out}{err}");
+    assert_eq!(told(disk.path(), &fetch, "/downloaded/n_shards"), (Some(0), 1.into()));
     assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
 }
 

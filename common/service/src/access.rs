@@ -7,7 +7,6 @@
 //! (`Sec-Fetch-Site`). Writes take JSON only ([`crate::routes`]), which a page cannot post to another origin without
 //! a CORS preflight, and CORS is off unless an origin was configured.
 
-use std::io;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
@@ -36,24 +35,10 @@ pub struct AccessSettings {
     pub token_file: Option<PathBuf>,
 }
 
+/// Settings that are refused: what, and what was expected.
 #[derive(Debug, thiserror::Error)]
-pub enum AccessError {
-    #[error("the token file: {cause}; it needs a token of at least {MIN_TOKEN_CHARS} characters")]
-    Unreadable { cause: io::Error },
-    #[error(
-        "the token file {} holds {found}, expected one line of at least {MIN_TOKEN_CHARS} visible ASCII characters; `openssl rand -hex 32` makes one",
-        path.display()
-    )]
-    Token {
-        path: PathBuf,
-        /// A description, not the token.
-        found: String,
-    },
-    #[error(
-        "the origin {found:?} is none, expected SCHEME://HOST or SCHEME://HOST:PORT, such as https://map.example"
-    )]
-    Origin { found: String },
-}
+#[error("{0}")]
+pub struct AccessError(String);
 
 /// Accepted writes.
 #[derive(Clone)]
@@ -272,18 +257,24 @@ fn are_equal(a: &[u8], b: &[u8]) -> bool {
 }
 
 fn read_token(path: &Path) -> Result<String, AccessError> {
-    let bytes =
-        files::read_short(path, MAX_TOKEN_BYTES).map_err(|cause| AccessError::Unreadable { cause })?;
-    let refused = |found: String| Err(AccessError::Token { path: path.to_owned(), found });
+    let unreadable = |cause| {
+        AccessError(format!(
+            "the token file: {cause}; it needs a token of at least {MIN_TOKEN_CHARS} characters"
+        ))
+    };
+    let bytes = files::read_short(path, MAX_TOKEN_BYTES).map_err(unreadable)?;
     let text = String::from_utf8_lossy(&bytes);
     let token = text.trim();
-    if token.len() < MIN_TOKEN_CHARS {
-        return refused(format!("{} characters", token.len()));
-    }
-    if !token.bytes().all(|b| b.is_ascii_graphic()) {
-        return refused("several words or other characters".to_owned());
-    }
-    Ok(token.to_owned())
+    // A description, not the token.
+    let found = match token.len() {
+        n if n < MIN_TOKEN_CHARS => format!("{n} characters"),
+        _ if token.bytes().all(|b| b.is_ascii_graphic()) => return Ok(token.to_owned()),
+        _ => "several words or other characters".to_owned(),
+    };
+    Err(AccessError(format!(
+        "the token file {} holds {found}, expected one line of at least {MIN_TOKEN_CHARS} visible ASCII characters; `openssl rand -hex 32` makes one",
+        path.display()
+    )))
 }
 
 fn checked_origin(text: &str) -> Result<String, AccessError> {
@@ -294,7 +285,9 @@ fn checked_origin(text: &str) -> Result<String, AccessError> {
     };
     match authority.is_some_and(|(_, authority)| is_sound(authority)) {
         true => Ok(text.to_owned()),
-        false => Err(AccessError::Origin { found: text.to_owned() }),
+        false => Err(AccessError(format!(
+            "the origin {text:?} is none, expected SCHEME://HOST or SCHEME://HOST:PORT, such as https://map.example"
+        ))),
     }
 }
 

@@ -66,7 +66,10 @@ impl Listen {
     pub fn tls(&self, files: Option<TlsFiles>) -> Result<Option<Tls>, TlsError> {
         match (self, files) {
             (_, None) => Ok(None),
-            (Self::Unix(_), Some(_)) => Err(TlsError::UnixSocket),
+            (Self::Unix(_), Some(_)) => {
+                let advice = "TLS is for IP:PORT, not for a Unix socket; leave --tls-cert and --tls-key out";
+                Err(TlsError(advice.to_owned()))
+            }
             (Self::Tcp(_), Some(files)) => Tls::open(files).map(Some),
         }
     }

@@ -93,8 +93,13 @@ fn admitted(access: &Access, request: &Request) -> Result<(), Problem> {
 }
 
 fn panicked(panic: Box<dyn Any + Send>) -> Response {
+    Problem::internal(format!("a handler panicked: {}", panic_text(&*panic))).into_response()
+}
+
+/// Returns what a panic said.
+pub fn panic_text(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied().or(panic.downcast_ref::<String>().map(String::as_str));
-    Problem::internal(format!("a handler panicked: {}", text.unwrap_or("without a message"))).into_response()
+    text.unwrap_or("without a message")
 }
 
 #[cfg(test)]

@@ -24,15 +24,10 @@ pub struct TlsFiles {
     pub key: PathBuf,
 }
 
+/// No certificate with its key: the files, what was found, and what was expected.
 #[derive(Debug, thiserror::Error)]
-pub enum TlsError {
-    #[error("{}: {cause}, expected {expected} in PEM", path.display())]
-    File { path: PathBuf, expected: &'static str, cause: String },
-    #[error("TLS is for IP:PORT, not for a Unix socket; leave --tls-cert and --tls-key out")]
-    UnixSocket,
-    #[error("{} and {}: {cause}, expected a certificate and its own key", cert.display(), key.display())]
-    Pair { cert: PathBuf, key: PathBuf, cause: rustls::Error },
-}
+#[error("{0}")]
+pub struct TlsError(pub(crate) String);
 
 /// State of both files, read without their content.
 type Stamps = [Option<(SystemTime, u64)>; 2];
@@ -119,20 +114,24 @@ fn read(files: &TlsFiles, provider: &CryptoProvider) -> Result<CertifiedKey, Tls
         if chain.is_empty() { Err(pem::Error::NoItemsFound) } else { Ok(chain) }
     })?;
     let key = read_pem(&files.key, "a private key", PrivateKeyDer::from_pem_slice)?;
-    let pair = |cause| TlsError::Pair { cert: files.cert.clone(), key: files.key.clone(), cause };
-    CertifiedKey::from_der(chain, key, provider).map_err(pair)
+    CertifiedKey::from_der(chain, key, provider).map_err(|cause| {
+        let (cert, key) = (files.cert.display(), files.key.display());
+        TlsError(format!("{cert} and {key}: {cause}, expected a certificate and its own key"))
+    })
 }
 
 fn read_pem<T>(
     path: &Path,
-    expected: &'static str,
+    expected: &str,
     parse: impl FnOnce(&[u8]) -> Result<T, pem::Error>,
 ) -> Result<T, TlsError> {
-    let file = |cause: String| TlsError::File { path: path.to_owned(), expected, cause };
-    let bytes = files::read_short(path, MAX_BYTES).map_err(|e| file(e.to_string()))?;
+    let file = |cause: &dyn fmt::Display| {
+        TlsError(format!("{}: {cause}, expected {expected} in PEM", path.display()))
+    };
+    let bytes = files::read_short(path, MAX_BYTES).map_err(|e| file(&e))?;
     parse(&bytes).map_err(|e| match e {
-        pem::Error::NoItemsFound => file("none is there".to_owned()),
-        e => file(e.to_string()),
+        pem::Error::NoItemsFound => file(&"none is there"),
+        e => file(&e),
     })
 }
 

@@ -11,10 +11,7 @@ mod locate;
 mod picture;
 mod place;
 mod stand;
-mod stdin;
 mod tools;
 
 pub use args::Args;
-pub use locate::MAX_MESSAGE_BYTES;
-pub use stdin::ShortTexts;
 pub use tools::Tools;

@@ -9,7 +9,7 @@ use slag_robot::{Robot, xyz};
 
 /// Longest photo, characters in base64: a file of 6 MB.
 pub const MAX_PHOTO_CHARS: usize = 8_000_000;
-/// Longest message on either transport. The tool reports photos beyond their own limit.
+/// Longest message over HTTP. The tool reports photos beyond their own limit.
 pub const MAX_MESSAGE_BYTES: usize = 2 * MAX_PHOTO_CHARS;
 /// With or without padding.
 const BASE64: GeneralPurpose = GeneralPurpose::new(

@@ -1,13 +1,13 @@
 //! The node: its subscriptions, services and publications.
 
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow};
 use ros2_client::qos::{Durability, History, WhenFull};
 use ros2_client::{
-    Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, QosProfile, Server,
-    ServiceMapping, ServiceTypeName, Subscription,
+    Context, Message, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, QosProfile,
+    ServiceMapping, ServiceTypeName,
 };
 use rustdds::{DomainParticipantBuilder, Topic};
 use serde::Serialize;
@@ -93,7 +93,7 @@ impl Navigation {
 
     /// Cancels the newest goal, if it has not ended, and waits until that is sent.
     async fn stop(&self) {
-        let newest = self.newest.lock().expect("no holder panics").take();
+        let newest = lock(&self.newest).take();
         if let Some((stop, ended)) = newest
             && stop.send(()).is_ok()
             && tokio::time::timeout(STOP_TIMEOUT, ended).await.is_err()
@@ -196,76 +196,123 @@ impl Shared {
 
     /// Subscribes to questions and offers services.
     fn answer_asked(self: &Arc<Self>, node: &mut Node) -> Result<()> {
-        let (args, volatile, text) = (&self.args, reliable(10), ("std_msgs", "String"));
-        let texts = subscription::<Text>(node, args.own("query")?, text, &volatile)?;
-        let shared = Arc::clone(self);
-        tokio::spawn(listen(texts, async move |text: Text| {
-            Arc::clone(&shared).publish_answers(text.data).await;
-        }));
-        let going = subscription::<Text>(node, args.own("go_to")?, text, &volatile)?;
-        let shared = Arc::clone(self);
-        tokio::spawn(listen(going, async move |text: Text| {
-            if let Err(reason) = Arc::clone(&shared).go(text.data.clone()).await {
-                tracing::warn!("{:?}: {reason}", text.data);
-                shared.stop_driving(&text.data, &reason).await;
-            }
-        }));
-        let mapping = args.mapping();
-        let kind = ServiceTypeName::new("slag_msgs", "Find");
-        let server =
-            node.create_server(mapping, &args.own("find")?, &kind, volatile.clone(), volatile.clone());
-        let shared = Arc::clone(self);
-        tokio::spawn(serve(
-            server.map_err(|e| anyhow!("cannot offer find: {e}"))?,
-            async move |request: FindRequest| Arc::clone(&shared).find(request).await,
-        ));
-        let kind = ServiceTypeName::new("slag_msgs", "Stand");
-        let server = node.create_server(mapping, &args.own("stand")?, &kind, volatile.clone(), volatile);
-        let shared = Arc::clone(self);
-        // A place that was asked for is not a goal: nothing is sent to navigation.
-        tokio::spawn(serve(
-            server.map_err(|e| anyhow!("cannot offer stand: {e}"))?,
-            async move |request: StandRequest| Arc::clone(&shared).stand(request.text).await,
-        ));
-        Ok(())
+        let (volatile, text) = (reliable(10), ("std_msgs", "String"));
+        self.hear(node, self.args.own("query")?, text, &volatile, Self::publish_answers)?;
+        self.hear(node, self.args.own("go_to")?, text, &volatile, Self::hear_wish)?;
+        self.offer(node, "find", "Find", Self::find)?;
+        self.offer(node, "stand", "Stand", Self::stand)
     }
 
     fn listen_to_robot(self: &Arc<Self>, node: &mut Node) -> Result<()> {
         let args = &self.args;
         let (sensor, latched) =
             (QosProfile::subscription_default(), reliable(100).durability(Durability::TransientLocal));
-        let is_told = matches!(args.position, Source::Tf | Source::Odom);
-        if is_told || args.camera.is_some() {
+        if matches!(args.position, Source::Tf | Source::Odom) || args.camera.is_some() {
             for (topic, qos) in [("tf", &reliable(100)), ("tf_static", &latched)] {
-                let told = subscription(node, Name::new("/", topic)?, ("tf2_msgs", "TFMessage"), qos)?;
-                let shared = Arc::clone(self);
-                tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_transforms(told).await));
+                let kind = ("tf2_msgs", "TFMessage");
+                self.hear(node, Name::new("/", topic)?, kind, qos, Self::hear_transforms)?;
             }
         }
         if let Some(camera) = &args.camera {
-            let kind = ("sensor_msgs", "CameraInfo");
-            let told = subscription(node, Name::new(camera, "camera_info")?, kind, &sensor)?;
-            let shared = Arc::clone(self);
-            tokio::spawn(listen(told, async move |told| shared.hear_camera(told)));
+            let name = Name::new(camera, "camera_info")?;
+            self.hear(node, name, ("sensor_msgs", "CameraInfo"), &sensor, Self::hear_camera)?;
             let name = Name::new(&format!("{camera}/image_rect"), "compressed")?;
-            let told = subscription(node, name, ("sensor_msgs", "CompressedImage"), &sensor)?;
-            let shared = Arc::clone(self);
-            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_photo(told).await));
+            self.hear(node, name, ("sensor_msgs", "CompressedImage"), &sensor, Self::hear_photo)?;
         }
-        let shared = Arc::clone(self);
         match args.position {
             Source::Odom => {
-                let told = subscription(node, Name::new("/", "odom")?, ("nav_msgs", "Odometry"), &sensor)?;
-                tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_odometry(told).await));
+                let (name, kind) = (Name::new("/", "odom")?, ("nav_msgs", "Odometry"));
+                self.hear(node, name, kind, &sensor, Self::hear_odometry)
             }
             Source::Fix => {
-                let told = subscription(node, Name::new("/", "fix")?, ("sensor_msgs", "NavSatFix"), &sensor)?;
-                tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_fix(told).await));
+                let (name, kind) = (Name::new("/", "fix")?, ("sensor_msgs", "NavSatFix"));
+                self.hear(node, name, kind, &sensor, Self::hear_fix)
             }
-            Source::Tf | Source::None => {}
+            Source::Tf | Source::None => Ok(()),
         }
+    }
+
+    /// Subscribes to a topic, and handles its messages in sequence.
+    fn hear<M: Message + Send + Sync + 'static, F: Future<Output = ()> + Send + 'static>(
+        self: &Arc<Self>,
+        node: &mut Node,
+        name: Name,
+        kind: (&str, &str),
+        qos: &QosProfile,
+        handle: impl Fn(Arc<Self>, M) -> F + Send + 'static,
+    ) -> Result<()> {
+        let topic = topic(node, &name, kind, qos)?;
+        let told = node.create_subscription::<M>(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))?;
+        let shared = Arc::clone(self);
+        tokio::spawn(async move {
+            loop {
+                match told.async_take().await {
+                    Ok((message, _)) => handle(Arc::clone(&shared), message).await,
+                    Err(error) => {
+                        tracing::warn!("a message cannot be read: {error}");
+                        tokio::time::sleep(READ_PAUSE).await;
+                    }
+                }
+            }
+        });
         Ok(())
     }
+
+    /// Offers a service, and answers its calls in sequence.
+    fn offer<Q, R, F>(
+        self: &Arc<Self>,
+        node: &mut Node,
+        name: &str,
+        kind: &str,
+        answer: impl Fn(Arc<Self>, Q) -> F + Send + 'static,
+    ) -> Result<()>
+    where
+        Q: Message + Send + Sync + Clone + 'static,
+        R: Message + Send + Sync + Clone + 'static,
+        F: Future<Output = R> + Send + 'static,
+    {
+        let (mapping, kind, qos) =
+            (self.args.mapping(), ServiceTypeName::new("slag_msgs", kind), reliable(10));
+        let server = node.create_server::<Q, R>(mapping, &self.args.own(name)?, &kind, qos.clone(), qos);
+        let server = server.map_err(|e| anyhow!("cannot offer {name}: {e}"))?;
+        let shared = Arc::clone(self);
+        tokio::spawn(async move {
+            loop {
+                let (id, request) = match server.async_receive_request().await {
+                    Ok(received) => received,
+                    Err(error) => {
+                        tracing::warn!("a call cannot be read: {error}");
+                        tokio::time::sleep(READ_PAUSE).await;
+                        continue;
+                    }
+                };
+                let reply = answer(Arc::clone(&shared), request).await;
+                if let Err(error) = server.async_send_response(id, reply).await {
+                    tracing::warn!("a reply cannot be sent: {error:?}");
+                }
+            }
+        });
+        Ok(())
+    }
+
+    /// Asks the robot's program off the async threads.
+    async fn blocking<T: Send + 'static>(
+        self: &Arc<Self>,
+        ask: impl FnOnce(&Self) -> T + Send + 'static,
+    ) -> Result<T, String> {
+        let shared = Arc::clone(self);
+        let asked = tokio::task::spawn_blocking(move || ask(&shared)).await;
+        asked.map_err(|error| format!("slag-ros failed: {error}"))
+    }
+
+    /// Returns the robot's place in the scene, if known.
+    fn place(&self) -> Option<[f64; 3]> {
+        lock(&self.place).0
+    }
+}
+
+fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
+    of.lock().expect("no holder panics")
 }
 
 /// Returns the usual QoS of topics: reliable, keeping the last few messages.
@@ -290,53 +337,11 @@ fn publisher<M: Serialize>(
     node.create_publisher(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))
 }
 
-fn subscription<M: 'static>(
-    node: &mut Node,
-    name: Name,
-    kind: (&str, &str),
-    qos: &QosProfile,
-) -> Result<Subscription<M>> {
-    let topic = topic(node, &name, kind, qos)?;
-    node.create_subscription(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))
-}
-
-/// Handles the messages of a topic in sequence.
-async fn listen<M: ros2_client::Message + 'static>(topic: Subscription<M>, handle: impl AsyncFn(M)) {
-    loop {
-        match topic.async_take().await {
-            Ok((message, _)) => handle(message).await,
-            Err(error) => {
-                tracing::warn!("a message cannot be read: {error}");
-                tokio::time::sleep(READ_PAUSE).await;
-            }
-        }
-    }
-}
-
-/// Answers the calls of a service in sequence.
-async fn serve<Q: ros2_client::Message + 'static, R: ros2_client::Message + 'static>(
-    server: Server<Q, R>,
-    answer: impl AsyncFn(Q) -> R,
-) {
-    loop {
-        let (id, request) = match server.async_receive_request().await {
-            Ok(received) => received,
-            Err(error) => {
-                tracing::warn!("a call cannot be read: {error}");
-                tokio::time::sleep(READ_PAUSE).await;
-                continue;
-            }
-        };
-        if let Err(error) = server.async_send_response(id, answer(request).await).await {
-            tracing::warn!("a reply cannot be sent: {error:?}");
-        }
-    }
-}
-
 impl Shared {
     async fn find(self: Arc<Self>, request: FindRequest) -> FindReply {
         let (text, header) = (request.text.clone(), answers::header(&self.args.scene_frame));
-        let (answers, message) = match self.ask(request, false).await {
+        let found = self.blocking(move |shared| shared.ask(&request, false)).await.flatten();
+        let (answers, message) = match found {
             Ok(found) => (found.answers, found.reason),
             Err(message) => (Vec::new(), message),
         };
@@ -344,25 +349,29 @@ impl Shared {
         FindReply { success: !answers.is_empty(), message, detections }
     }
 
-    async fn stand(self: Arc<Self>, text: String) -> StandReply {
-        let place = self.place.lock().expect("no holder panics").0;
-        let frame = self.args.scene_frame.clone();
-        let asked = tokio::task::spawn_blocking(move || self.args.stand(&self.robot, &text, place)).await;
-        stand::reply(&frame, asked.unwrap_or_else(|error| Err(format!("slag-ros failed: {error}"))))
+    /// A place that was asked for is not a goal: nothing is sent to navigation.
+    async fn stand(self: Arc<Self>, request: StandRequest) -> StandReply {
+        let ask = move |shared: &Self| shared.args.stand(&shared.robot, &request.text, shared.place());
+        stand::reply(&self.args.scene_frame, self.blocking(ask).await.flatten())
+    }
+
+    /// Sends the robot to a thing. Without a place to stand there, the goal of an earlier wish is outdated.
+    async fn hear_wish(self: Arc<Self>, Text { data: text }: Text) {
+        let Err(reason) = self.go(text.clone()).await else { return };
+        tracing::warn!("{text:?}: {reason}");
+        if let Some(navigation) = &self.navigation {
+            navigation.stop().await;
+            publish(&navigation.state, Text { data: format!("{text}: failed: {reason}") }).await;
+        }
     }
 
     /// Publishes a place to stand near a thing and the ground on the way, or returns why there is none.
-    async fn go(self: Arc<Self>, text: String) -> Result<(), String> {
-        let shared = Arc::clone(&self);
-        let ground = tokio::task::spawn_blocking(move || {
-            let place = shared.place.lock().expect("no holder panics").0;
-            shared.args.ground(&shared.robot, place)
-        });
-        let ground = ground.await.map_err(|error| format!("slag-ros failed: {error}"))??;
+    async fn go(self: &Arc<Self>, text: String) -> Result<(), String> {
+        let ground = self.blocking(|shared| shared.args.ground(&shared.robot, shared.place())).await??;
         if let Some(ground) = ground {
             publish(&self.ground, ground).await;
         }
-        let reply = Arc::clone(&self).stand(text.clone()).await;
+        let reply = Arc::clone(self).stand(StandRequest { text: text.clone() }).await;
         if !reply.success {
             return Err(reply.message);
         }
@@ -374,8 +383,8 @@ impl Shared {
             // Nav2 may reject the new goal: the robot must not drive on to the old one.
             navigation.stop().await;
             let ((stop, stopped), (ended, has_ended)) = (oneshot::channel(), oneshot::channel());
-            *navigation.newest.lock().expect("no holder panics") = Some((stop, has_ended));
-            let (shared, tokio) = (Arc::clone(&self), Handle::current());
+            *lock(&navigation.newest) = Some((stop, has_ended));
+            let (shared, tokio) = (Arc::clone(self), Handle::current());
             // The streams of an action are not Send, so its task has a thread.
             std::thread::spawn(move || {
                 let _ended: oneshot::Sender<()> = ended;
@@ -400,22 +409,13 @@ impl Shared {
         }
     }
 
-    /// Cancels the newest goal because a later wish has no place to stand; its goal is outdated.
-    async fn stop_driving(&self, text: &str, reason: &str) {
-        if let Some(navigation) = &self.navigation {
-            navigation.stop().await;
-            publish(&navigation.state, Text { data: format!("{text}: failed: {reason}") }).await;
-        }
-    }
-
     /// Publishes the objects on board whenever they change. Reports when the robot's program stops or starts
     /// answering: topics alone are silent then.
     async fn watch(self: Arc<Self>) {
         let (mut answered, mut on_board) = (None, None);
         loop {
-            let shared = Arc::clone(&self);
             let listing = [("limit", answers::MAX_OBJECTS.to_string())];
-            let asked = tokio::task::spawn_blocking(move || shared.robot.objects(&listing)).await;
+            let asked = self.blocking(move |shared| shared.robot.objects(&listing)).await;
             let (listed, error) = match asked {
                 Ok(Ok(page)) => (Some(page), None),
                 Ok(Err(error @ RobotError::Unreachable { .. })) => (None, Some(error)),
@@ -440,15 +440,10 @@ impl Shared {
         }
     }
 
-    async fn ask(self: Arc<Self>, request: FindRequest, with_points: bool) -> Result<Found, String> {
-        let asked = tokio::task::spawn_blocking(move || self.ask_now(&request, with_points)).await;
-        asked.map_err(|error| format!("slag-ros failed: {error}"))?
-    }
-
-    fn ask_now(&self, request: &FindRequest, with_points: bool) -> Result<Found, String> {
+    fn ask(&self, request: &FindRequest, with_points: bool) -> Result<Found, String> {
         let limit = if request.limit == 0 { self.args.limit } else { request.limit };
         let mut asked = json!({"texts": [request.text], "limit": limit});
-        if let Some(place) = self.place.lock().expect("no holder panics").0 {
+        if let Some(place) = self.place() {
             asked["near"] = json!(place);
         }
         let reply = self.robot.ask(&asked).map_err(|e| e.to_string())?;
@@ -465,9 +460,9 @@ impl Shared {
     }
 
     /// Answers a text on all topics. No match is an empty answer, which clears viewers.
-    async fn publish_answers(self: Arc<Self>, text: String) {
+    async fn publish_answers(self: Arc<Self>, Text { data: text }: Text) {
         let request = FindRequest { text: text.clone(), limit: 0 };
-        let found = match Arc::clone(&self).ask(request, true).await {
+        let found = match self.blocking(move |shared| shared.ask(&request, true)).await.flatten() {
             Ok(found) => found,
             Err(error) => return tracing::warn!("{text:?}: {error}"),
         };
@@ -487,7 +482,7 @@ impl Shared {
 
     async fn hear_transforms(self: Arc<Self>, told: TransformMessages) {
         let place = {
-            let mut frames = self.frames.lock().expect("no holder panics");
+            let mut frames = lock(&self.frames);
             told.transforms.into_iter().for_each(|transform| frames.insert(transform));
             position::of_frame(&frames, &self.args.scene_frame, &self.args.base_frame)
         };
@@ -499,10 +494,7 @@ impl Shared {
     }
 
     async fn hear_odometry(self: Arc<Self>, told: Odometry) {
-        let place = {
-            let frames = self.frames.lock().expect("no holder panics");
-            position::of_odometry(&frames, &self.args.scene_frame, &told)
-        };
+        let place = position::of_odometry(&lock(&self.frames), &self.args.scene_frame, &told);
         match place {
             Some(place) => self.moved_to(place).await,
             None => tracing::debug!("nothing connects {} to the scene", told.header.frame_id),
@@ -517,9 +509,9 @@ impl Shared {
         }
     }
 
-    fn hear_camera(&self, told: CameraInfo) {
+    async fn hear_camera(self: Arc<Self>, told: CameraInfo) {
         if let Some(locating) = &self.locating {
-            *locating.camera.lock().expect("no holder panics") = Some(told);
+            *lock(&locating.camera) = Some(told);
         }
     }
 
@@ -529,18 +521,15 @@ impl Shared {
         let Some(camera) = locating.camera_of_due_photo() else { return };
         let Args { scene_frame, base_frame, fixed_frame, .. } = &self.args;
         let optical_frame = photo.header.frame_id.clone();
-        let of_camera = {
-            let frames = self.frames.lock().expect("no holder panics");
-            CameraFrames::find(&frames, fixed_frame, &optical_frame, base_frame)
-        };
+        let of_camera = CameraFrames::find(&lock(&self.frames), fixed_frame, &optical_frame, base_frame);
         let Some(of_camera) = of_camera else {
             return tracing::warn!(
                 "nothing connects {optical_frame} with {fixed_frame} and {base_frame}: no photo is located"
             );
         };
         let header = answers::header(scene_frame);
-        let (shared, parameters) = (Arc::clone(&self), of_camera.parameters(&camera));
-        let asked = tokio::task::spawn_blocking(move || shared.robot.locate(&parameters, &photo.data)).await;
+        let parameters = of_camera.parameters(&camera);
+        let asked = self.blocking(move |shared| shared.robot.locate(&parameters, &photo.data)).await;
         let pose = match asked {
             Ok(Ok(locate::Answer::Found(pose))) => pose,
             Ok(Ok(locate::Answer::Unsure { reason, .. } | locate::Answer::Lost { reason })) => {
@@ -556,7 +545,7 @@ impl Shared {
         let CameraFrames { fixed_from_optical, optical_from_base } = of_camera;
         let fixed_from_scene = fixed_from_optical.after(scene_from_optical.inverse());
         let base_in_fixed = fixed_from_optical.after(optical_from_base).origin();
-        let agreed = locating.fixes.lock().expect("no holder panics").add(fixed_from_scene, base_in_fixed);
+        let agreed = lock(&locating.fixes).add(fixed_from_scene, base_in_fixed);
         if let Some(fixed_from_scene) = agreed {
             let transform = TransformStamped {
                 header: answers::header(fixed_frame),
@@ -564,13 +553,13 @@ impl Shared {
                 translation: fixed_from_scene.origin().into(),
                 rotation: fixed_from_scene.quaternion(),
             };
-            self.frames.lock().expect("no holder panics").insert(transform.clone());
+            lock(&self.frames).insert(transform.clone());
             publish(&locating.transforms, TransformMessages { transforms: vec![transform] }).await;
         }
     }
 
     async fn moved_to(self: Arc<Self>, [x, y, z]: [f64; 3]) {
-        self.place.lock().expect("no holder panics").0 = Some([x, y, z]);
+        lock(&self.place).0 = Some([x, y, z]);
         if self.is_due() {
             self.post(json!({"x": x, "y": y, "z": z})).await;
         }
@@ -578,7 +567,7 @@ impl Shared {
 
     /// Returns whether a position may be posted, and if so restarts the interval.
     fn is_due(&self) -> bool {
-        let (_, posted) = &mut *self.place.lock().expect("no holder panics");
+        let (_, posted) = &mut *lock(&self.place);
         let is_due = posted.is_none_or(|posted| posted.elapsed() >= self.args.position_period);
         if is_due {
             *posted = Some(Instant::now());
@@ -587,13 +576,12 @@ impl Shared {
     }
 
     async fn post(self: Arc<Self>, place: Value) {
-        let shared = Arc::clone(&self);
-        let posted = tokio::task::spawn_blocking(move || shared.robot.post_position(&place)).await;
-        let Ok(posted) = posted else { return };
+        let Ok(posted) = self.blocking(move |shared| shared.robot.post_position(&place)).await else {
+            return;
+        };
         // Positions come ten times a second: a reason is told once.
         let reason = posted.err().map(|error| error.to_string());
-        let before =
-            std::mem::replace(&mut *self.not_taken.lock().expect("no holder panics"), reason.clone());
+        let before = std::mem::replace(&mut *lock(&self.not_taken), reason.clone());
         if let Some(reason) = reason.filter(|reason| before.as_ref() != Some(reason)) {
             tracing::warn!("the position is not taken: {reason}");
         }
@@ -614,8 +602,8 @@ impl Locating {
 
     /// Returns the camera of a photo, if known and due; then restarts the interval.
     fn camera_of_due_photo(&self) -> Option<CameraInfo> {
-        let camera = self.camera.lock().expect("no holder panics").clone()?;
-        let mut last = self.last.lock().expect("no holder panics");
+        let camera = lock(&self.camera).clone()?;
+        let mut last = lock(&self.last);
         let is_due = last.is_none_or(|last| last.elapsed() >= PHOTO_PERIOD);
         is_due.then(|| *last = Some(Instant::now()))?;
         Some(camera)

@@ -36,7 +36,7 @@ impl CacheArgs {
     /// Opens the named cache, or the user's default.
     pub fn open(self) -> Result<EdgeCache, Failure> {
         let dir = self.cache.or_else(|| cache_folder(variable));
-        let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
+        let advice = || Failure::usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
         Ok(EdgeCache::open(dir.ok_or_else(advice)?))
     }
 }
@@ -88,7 +88,7 @@ impl ThreadArgs {
     pub fn apply(&self) -> Result<(), Failure> {
         let Some(n) = self.threads else { return Ok(()) };
         let built = rayon::ThreadPoolBuilder::new().num_threads(n as usize).build_global();
-        built.map_err(|e| Failure::Failed("threads", e.into()))
+        built.map_err(|e| Failure::failed("threads", e))
     }
 }
 
@@ -100,10 +100,31 @@ pub struct ModelArgs {
     pub how: RunArgs,
 }
 
+/// What answers questions: the shards on board and a text model.
+#[derive(Debug, Args)]
+pub struct EngineArgs {
+    #[command(flatten)]
+    pub threads: ThreadArgs,
+    #[command(flatten)]
+    pub cache: CacheArgs,
+    #[command(flatten)]
+    pub models: ModelArgs,
+}
+
+impl EngineArgs {
+    /// Opens what is on board.
+    pub fn open(self) -> Result<Engine, Failure> {
+        self.threads.apply()?;
+        let engine = engine(self.cache.open()?, &self.models)?;
+        engine.reload()?;
+        Ok(engine)
+    }
+}
+
 /// Makes an engine from a cache and a text model; without one given, scenes' own models are used.
 pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
     let (given, options) = text_model(models)?;
-    let open = || TextService::open(&given, &options).map_err(|e| Failure::Failed("models", e.into()));
+    let open = || TextService::open(&given, &options).map_err(|e| Failure::failed("models", e));
     match &models.models {
         Some(_) => Ok(Engine::new(cache, open()?)),
         None => Engine::with_carried(cache, options.clone(), open),
@@ -111,10 +132,9 @@ pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
 }
 
 pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
-    let failed = |error| Failure::Failed("models", error);
     let models = model_commands::open(args.models.as_deref(), &variable);
-    let options = session_options(&args.how).map_err(|e| failed(e.into()))?;
-    Ok((models.map_err(|e| failed(e.into()))?, options))
+    let options = session_options(&args.how).map_err(|e| Failure::failed("models", e))?;
+    Ok((models.map_err(|e| Failure::failed("models", e))?, options))
 }
 
 /// Returns the options for one text at a time, with a few threads.

@@ -8,7 +8,7 @@ use clap::Args;
 use slag_api::changes::{ChangedThing, ChangesReply, MovedThing};
 
 use super::args::{CacheArgs, ModelArgs, engine};
-use super::failure::{Failure, store_failure};
+use super::failure::Failure;
 use super::output::print_json;
 
 #[derive(Debug, Args)]
@@ -32,11 +32,11 @@ pub struct ChangesArgs {
 
 pub fn run(args: ChangesArgs) -> Result<(), Failure> {
     let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload().map_err(store_failure)?;
+    engine.reload()?;
     let request = ChangesRequest { from: args.from, to: args.to, ball: None, texts: args.texts };
     let reply = engine.changes(&request, &Budget::default()).map_err(|error| match error {
         ChangesError::Query(error) => error.into(),
-        other => Failure::Failed(other.kind(), other.into()),
+        other => Failure::failed(other.kind(), other),
     })?;
     if args.json {
         return print_json(&reply);

@@ -10,7 +10,7 @@ use slag_common::ByteSize;
 use slag_common::tuf::format_utc;
 
 use super::args::{CacheArgs, ModelArgs, engine};
-use super::failure::{Failure, store_failure};
+use super::failure::Failure;
 use super::output::print_json;
 use super::text::visible;
 use crate::error_line;
@@ -60,9 +60,9 @@ struct Finding {
     text: String,
 }
 
-impl Finding {
-    fn new(what: &'static str, verdict: Verdict, text: impl Into<String>) -> Self {
-        Self { what, verdict, text: text.into() }
+impl Verdict {
+    fn on(self, what: &'static str, text: impl Into<String>) -> Finding {
+        Finding { what, verdict: self, text: text.into() }
     }
 }
 
@@ -77,7 +77,7 @@ pub fn run(args: DoctorArgs) -> Result<(), Failure> {
     }
     match findings.iter().filter(|finding| finding.verdict == Verdict::Missing).count() {
         0 => Ok(()),
-        n => Err(Failure::Failed("doctor", anyhow!("this robot cannot answer yet: {n} missing"))),
+        n => Err(Failure::failed("doctor", anyhow!("this robot cannot answer yet: {n} missing"))),
     }
 }
 
@@ -99,10 +99,10 @@ fn disk(cache: &EdgeCache) -> Finding {
     // No fetch has made the folder yet: use the disk of its nearest ancestor.
     let there = dir.ancestors().find(|dir| or_here(dir).is_dir()).map_or(dir, or_here);
     match cache.files().free_bytes(there) {
-        Err(error) => Finding::new("disk", Verdict::Missing, format!("{error}; give another --cache")),
+        Err(error) => Verdict::Missing.on("disk", format!("{error}; give another --cache")),
         Ok(free) => {
             let verdict = if free < LITTLE_BYTES { Verdict::Note } else { Verdict::Ok };
-            Finding::new("disk", verdict, format!("{} free for {}", ByteSize(free), dir.display()))
+            verdict.on("disk", format!("{} free for {}", ByteSize(free), dir.display()))
         }
     }
 }
@@ -116,19 +116,19 @@ fn trust(cache: &EdgeCache) -> Finding {
         Ok(Some(accepted)) => accepted,
         Ok(None) => {
             let advice = "no store; the cloud's `slag-encoder serve` prints the line: slag-edge trust add URL --sha256 HEX";
-            return Finding::new("trust", Verdict::Missing, advice);
+            return Verdict::Missing.on("trust", advice);
         }
-        Err(error) => return Finding::new("trust", Verdict::Missing, error_line(&error)),
+        Err(error) => return Verdict::Missing.on("trust", error_line(&error)),
     };
     let root = format!("root {} {}", accepted.root_version, accepted.root_sha256);
     match accepted.expires_unix_secs {
         Some(expires) if expires <= crate::now_unix_secs() => {
             let text = format!("{root}; its news ended {}: fetch again", format_utc(expires));
-            Finding::new("trust", Verdict::Note, text)
+            Verdict::Note.on("trust", text)
         }
         expires => {
             let until = expires.map_or(String::new(), |at| format!(", current until {}", format_utc(at)));
-            Finding::new("trust", Verdict::Ok, root + &until)
+            Verdict::Ok.on("trust", root + &until)
         }
     }
 }
@@ -138,11 +138,11 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
         Ok(snapshot) => snapshot,
         Err(StoreError::Empty { .. }) => {
             let advice = "nothing fetched yet: slag-edge fetch --from URL --at X,Y,Z --radius 50";
-            return vec![Finding::new("scene", Verdict::Missing, advice)];
+            return vec![Verdict::Missing.on("scene", advice)];
         }
         Err(error) => {
             let text = format!("{}; fetch again", error_line(&error));
-            return vec![Finding::new("scene", Verdict::Missing, text)];
+            return vec![Verdict::Missing.on("scene", text)];
         }
     };
     let status = Status::of(&snapshot);
@@ -156,12 +156,11 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
         ByteSize(status.len_bytes)
     );
     let place = format!("{} {unit} around {:.2}", status.radius, status.centre_in_world);
-    let mut findings =
-        vec![Finding::new("scene", Verdict::Ok, scene), Finding::new("place", Verdict::Ok, place)];
+    let mut findings = vec![Verdict::Ok.on("scene", scene), Verdict::Ok.on("place", place)];
     if let Some(signed) = accepted(cache).ok().flatten().and_then(|accepted| accepted.signed_unix_secs) {
         findings.push(age(signed, crate::now_unix_secs()));
     }
-    let mut note = |what, text: &str| findings.push(Finding::new(what, Verdict::Note, text));
+    let mut note = |what, text: &str| findings.push(Verdict::Note.on(what, text));
     if !status.bad_cells.is_empty() {
         note("cells", &format!("{} could not be fetched; fetch again", status.bad_cells.len()));
     }
@@ -180,16 +179,16 @@ fn age(signed_unix_secs: u64, now_unix_secs: u64) -> Finding {
         let text = format!(
             "the store signed it at {signed}, this robot's clock says {now}: set the one that is wrong"
         );
-        return Finding::new("age", Verdict::Note, text);
+        return Verdict::Note.on("age", text);
     };
     let hours = secs.saturating_sub(3600) as f64 / 3600.0;
     let text = format!("the store signed it {hours:.1} hours ago");
     if hours < LONG_AGO_HOURS {
-        return Finding::new("age", Verdict::Ok, text);
+        return Verdict::Ok.on("age", text);
     }
     let now = format_utc(now_unix_secs);
     let text = format!("{text}, if this robot's clock is right, which says {now}: fetch again, or set it");
-    Finding::new("age", Verdict::Note, text)
+    Verdict::Note.on("age", text)
 }
 
 fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
@@ -197,15 +196,15 @@ fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
         match engine.reload() {
             // An empty cache has nothing to compare with.
             Err(StoreError::Empty { .. }) => return Ok("opens".to_owned()),
-            other => other.map_err(store_failure)?,
+            other => other?,
         }
         let on_board = engine.on_board()?;
         on_board.check()?;
         Ok(format!("{} opens and fits the scene", Status::of(&on_board.snapshot).encoder_name))
     });
     match opened {
-        Ok(text) => Finding::new("text model", Verdict::Ok, text),
-        Err(failure) => Finding::new("text model", Verdict::Missing, failure.text()),
+        Ok(text) => Verdict::Ok.on("text model", text),
+        Err(failure) => Verdict::Missing.on("text model", failure.text()),
     }
 }
 

@@ -3,7 +3,8 @@
 use std::io::{self, Write};
 use std::process::ExitCode;
 
-use crate::query::QueryError;
+use crate::fetch::FetchError;
+use crate::query::{QueryError, RequestError};
 use crate::store::StoreError;
 
 use super::text::visible;
@@ -27,60 +28,62 @@ impl From<Exit> for ExitCode {
     }
 }
 
-pub enum Failure {
-    Usage(anyhow::Error),
-    /// The string names the error for programs.
-    Failed(&'static str, anyhow::Error),
-    /// A fetch got some cells only; its report is printed.
-    Partial(anyhow::Error),
-    Interrupted(anyhow::Error),
-    /// Nobody reads stdout any more.
-    BrokenPipe,
+/// What ended a command.
+pub struct Failure {
+    exit: Exit,
+    /// Names the error for programs.
+    kind: &'static str,
+    error: anyhow::Error,
 }
 
 impl Failure {
+    pub fn new(exit: Exit, kind: &'static str, error: impl Into<anyhow::Error>) -> Self {
+        Self { exit, kind, error: error.into() }
+    }
+
+    pub fn usage(error: impl Into<anyhow::Error>) -> Self {
+        Self::new(Exit::Usage, "usage", error)
+    }
+
+    pub fn failed(kind: &'static str, error: impl Into<anyhow::Error>) -> Self {
+        Self::new(Exit::Failed, kind, error)
+    }
+
     pub fn text(&self) -> String {
-        match self {
-            Self::BrokenPipe => String::new(),
-            Self::Usage(error) | Self::Failed(_, error) | Self::Partial(error) | Self::Interrupted(error) => {
-                crate::error_line(&**error)
-            }
-        }
+        crate::error_line(&*self.error)
     }
 
     /// Reports the error on stderr, or as JSON on stdout, and returns the exit code.
     pub fn report(self, json: bool) -> Exit {
-        let (exit, kind, error) = match self {
-            Self::BrokenPipe => return Exit::Done,
-            Self::Partial(error) => {
-                let _ = writeln!(io::stderr(), "error: {}", visible(&crate::error_line(&*error)));
-                return Exit::Partial;
+        let (kind, detail) = (self.kind, self.text());
+        let is_told = match self.exit {
+            // Nobody reads stdout any more.
+            Exit::Done => true,
+            // Its report is printed already.
+            Exit::Partial => false,
+            _ => {
+                json && {
+                    let error = serde_json::json!({ "error": { "kind": kind, "detail": detail } });
+                    writeln!(io::stdout(), "{error}").is_ok()
+                }
             }
-            Self::Usage(error) => (Exit::Usage, "usage", error),
-            Self::Failed(kind, error) => (Exit::Failed, kind, error),
-            Self::Interrupted(error) => (Exit::Interrupted, "interrupted", error),
-        };
-        let detail = crate::error_line(&*error);
-        let is_told = json && {
-            let error = serde_json::json!({ "error": { "kind": kind, "detail": detail } });
-            writeln!(io::stdout(), "{error}").is_ok()
         };
         if !is_told {
             let _ = writeln!(io::stderr(), "error: {}", visible(&detail));
         }
-        exit
+        self.exit
     }
 }
 
 impl From<io::Error> for Failure {
     fn from(error: io::Error) -> Self {
         match error.kind() {
-            io::ErrorKind::BrokenPipe => Self::BrokenPipe,
+            io::ErrorKind::BrokenPipe => Self::new(Exit::Done, "io", error),
             // Errors of files and connections name them: this one is of stdout.
             _ if error.raw_os_error().is_some() => {
-                Self::Failed("io", anyhow::anyhow!("the output could not be written: {error}"))
+                Self::failed("io", anyhow::anyhow!("the output could not be written: {error}"))
             }
-            _ => Self::Failed("io", error.into()),
+            _ => Self::failed("io", error),
         }
     }
 }
@@ -88,16 +91,33 @@ impl From<io::Error> for Failure {
 impl From<QueryError> for Failure {
     fn from(error: QueryError) -> Self {
         match error {
-            QueryError::Request(error) => Self::Usage(error.into()),
-            other => Self::Failed(other.kind(), other.into()),
+            QueryError::Request(error) => error.into(),
+            other => Self::failed(other.kind(), other),
         }
     }
 }
 
-/// Wraps an error of the cache; an empty cache has a kind of its own.
-pub fn store_failure(error: StoreError) -> Failure {
-    let kind = if matches!(error, StoreError::Empty { .. }) { "no-scene" } else { "store" };
-    Failure::Failed(kind, error.into())
+impl From<RequestError> for Failure {
+    fn from(error: RequestError) -> Self {
+        Self::usage(error)
+    }
+}
+
+/// An empty cache has a kind of its own.
+impl From<StoreError> for Failure {
+    fn from(error: StoreError) -> Self {
+        let kind = if matches!(error, StoreError::Empty { .. }) { "no-scene" } else { "store" };
+        Self::failed(kind, error)
+    }
+}
+
+impl From<FetchError> for Failure {
+    fn from(error: FetchError) -> Self {
+        match error {
+            FetchError::Cancelled => Self::new(Exit::Interrupted, "interrupted", error),
+            error => Self::failed("fetch", error),
+        }
+    }
 }
 
 #[cfg(test)]
@@ -114,10 +134,10 @@ mod tests {
     #[test]
     fn failures_have_their_exit_codes() {
         let error = || anyhow::anyhow!("x");
-        assert_eq!(Failure::Usage(error()).report(false), Exit::Usage);
-        assert_eq!(Failure::Failed("io", error()).report(false), Exit::Failed);
-        assert_eq!(Failure::Partial(error()).report(true), Exit::Partial);
-        assert_eq!(Failure::Interrupted(error()).report(false), Exit::Interrupted);
+        assert_eq!(Failure::usage(error()).report(false), Exit::Usage);
+        assert_eq!(Failure::failed("io", error()).report(false), Exit::Failed);
+        assert_eq!(Failure::new(Exit::Partial, "fetch", error()).report(true), Exit::Partial);
+        assert_eq!(Failure::from(FetchError::Cancelled).report(false), Exit::Interrupted);
         let full = Failure::from(io::Error::from_raw_os_error(28));
         assert!(full.text().starts_with("the output could not be written: "), "{}", full.text());
         assert_eq!(Failure::from(io::Error::from(io::ErrorKind::BrokenPipe)).report(false), Exit::Done);

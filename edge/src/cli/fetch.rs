@@ -12,9 +12,9 @@ use glam::DVec3;
 use slag_service::stop::on_stop;
 
 use super::args::{CacheArgs, DownloadArgs};
-use super::failure::Failure;
+use super::failure::{Exit, Failure};
 use super::follow::{FollowArgs, watch};
-use super::network::{environment, failure, parse_store};
+use super::network::{environment, parse_store};
 use super::output::print_json;
 use super::progress::{Bar, bad_cells, print_report};
 
@@ -62,23 +62,18 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     let cache = args.cache.open()?;
     let cancel = Arc::new(AtomicBool::new(false));
     let on_signal = Arc::clone(&cancel);
-    on_stop(move || on_signal.store(true, Ordering::Relaxed))
-        .map_err(|e| Failure::Failed("signals", e.into()))?;
+    on_stop(move || on_signal.store(true, Ordering::Relaxed)).map_err(|e| Failure::failed("signals", e))?;
     let bar = Bar::new(!quiet && !args.json && io::stderr().is_terminal());
     if args.watch {
         return watch(&cache, &request, ca.as_deref(), settings, &cancel, &bar, args.json);
     }
     let result = fetch(&cache, &request, &environment(ca.as_deref(), &cancel, &bar));
     bar.finish();
-    match result {
-        Ok(report) => {
-            if args.json { print_json(&report) } else { print_report(&report) }?;
-            match bad_cells(&report) {
-                Some(what) => Err(Failure::Partial(anyhow!(what))),
-                None => Ok(()),
-            }
-        }
-        Err(error) => Err(failure(error)),
+    let report = result?;
+    if args.json { print_json(&report) } else { print_report(&report) }?;
+    match bad_cells(&report) {
+        Some(what) => Err(Failure::new(Exit::Partial, "fetch", anyhow!(what))),
+        None => Ok(()),
     }
 }
 

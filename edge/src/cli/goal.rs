@@ -12,8 +12,8 @@ use slag_api::goal::{Goal, GoalReply, MissedThing, NoGoal};
 use slag_common::objects::parse_public_id;
 use slag_common::{durable, files};
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
-use super::failure::{Failure, store_failure};
+use super::args::EngineArgs;
+use super::failure::Failure;
 use super::output::print_json;
 use super::text::{table, visible};
 
@@ -42,11 +42,7 @@ pub struct GoalArgs {
     #[arg(long, value_name = "FILE.pgm")]
     pub map: Option<PathBuf>,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
     /// Print the poses as JSON.
     #[arg(long)]
     pub json: bool,
@@ -57,17 +53,15 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
         parse_public_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
     let GoalArgs { near, heading_rad, robot, stand, .. } = args;
     let request = GoalRequest { target, near, heading_rad, robot, stand };
-    request.check().map_err(|e| Failure::Usage(e.into()))?;
+    request.check()?;
     args.map.iter().try_for_each(|path| files::check_writable(path))?;
-    args.threads.apply()?;
-    let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload().map_err(store_failure)?;
+    let engine = args.engine.open()?;
     let on_board = engine.on_board()?;
     if let Some(path) = &args.map {
         let map = goal::floor_map(&on_board.snapshot, &request, &Budget::default()).map_err(failure)?;
         durable::write_result(path, |file| map.write_pgm(file))?;
     }
-    let reply = goal::find(&engine, &on_board, &request, &Budget::default()).map_err(failure)?;
+    let reply = goal::find(&on_board, &request, &Budget::default()).map_err(failure)?;
     if args.json {
         return print_json(&reply);
     }
@@ -77,7 +71,7 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
 fn failure(error: GoalError) -> Failure {
     match error {
         GoalError::Query(error) => error.into(),
-        other => Failure::Failed(other.kind(), other.into()),
+        other => Failure::failed(other.kind(), other),
     }
 }
 

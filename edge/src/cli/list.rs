@@ -10,8 +10,8 @@ use slag_api::objects::{Name, ObjectOnBoard, ObjectPage};
 use slag_common::frames::Aabb;
 use slag_common::note;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named, parse_radius, parse_reach};
-use super::failure::{Failure, store_failure};
+use super::args::{EngineArgs, named, parse_radius, parse_reach};
+use super::failure::Failure;
 use super::text::{table, visible};
 use crate::query::{ListFormat, ObjectFilter, ObjectOrder, check_region, parse_box, parse_point};
 use crate::score::{Ball, Budget, Region};
@@ -55,26 +55,19 @@ pub struct ListArgs {
     #[arg(long, conflicts_with = "format")]
     pub json: bool,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
 }
 
 pub fn run(args: ListArgs) -> Result<(), Failure> {
     let around = args.near.zip(args.radius);
     let ball = around.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
     let region = Region { ball, bounds: args.bounds, polygon: None };
-    check_region(&region).map_err(|e| Failure::Usage(e.into()))?;
+    check_region(&region)?;
     let filter = ObjectFilter { after: None, region, min_size: args.min_size, order: args.sort };
-    args.threads.apply()?;
-    let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload().map_err(store_failure)?;
+    let engine = args.engine.open()?;
     let on_board = engine.on_board()?;
     let format = if args.json { Some(ListFormat::Json) } else { args.format };
-    let checked = format.unwrap_or_default().check(&on_board.snapshot.manifest);
-    checked.map_err(|e| Failure::Usage(e.into()))?;
+    format.unwrap_or_default().check(&on_board.snapshot.manifest)?;
     let limit = args.limit.map_or(usize::MAX, NonZeroUsize::get);
     let page = engine.objects(&on_board, &filter, limit, NAMES_WAIT, &Budget::default())?;
     if let Err(error) = on_board.check() {
@@ -82,7 +75,7 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
     }
     match format {
         Some(format) => {
-            let text = format.write(&page).map_err(|e| Failure::Failed("json", e.into()))?;
+            let text = format.write(&page).map_err(|e| Failure::failed("json", e))?;
             let end: &[u8] = if format == ListFormat::Csv { b"" } else { b"\n" };
             Ok(io::stdout().write_all(&[&text, end].concat())?)
         }
@@ -112,18 +105,4 @@ fn print_page(page: &ObjectPage) -> Result<(), Failure> {
     let rows: Vec<Vec<String>> = page.objects.iter().map(row).collect();
     let head = [&format!("position [{unit}]"), &format!("size [{unit}]"), "id", "names"];
     Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
-}
-
-#[cfg(test)]
-mod tests {
-    use clap::Parser;
-
-    use crate::cli::{Cli, Exit};
-
-    /// As for questions: a flat box is empty, and no scene is opened.
-    #[test]
-    fn flat_boxes_are_refused() {
-        let line = ["slag-edge", "list", "--box", "0,0,1,5,5,1", "--cache", "nowhere"];
-        assert_eq!(Cli::try_parse_from(line).expect("a line").run(), Exit::Usage);
-    }
 }

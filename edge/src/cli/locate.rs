@@ -13,7 +13,7 @@ use crate::score::Budget;
 use crate::store::Snapshot;
 
 use super::args::{CacheArgs, parse_reach};
-use super::failure::{Failure, store_failure};
+use super::failure::Failure;
 use super::output::{print_json, print_pairs};
 
 const EXAMPLES: &str = "Examples:\n\
@@ -60,7 +60,7 @@ fn parse_centre(text: &str) -> Result<[f64; 2], String> {
 
 pub fn run(args: LocateArgs) -> Result<(), Failure> {
     let cache = args.cache.open()?;
-    let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
+    let snapshot = Snapshot::open(&cache)?;
     let prior =
         args.near.zip(args.sigma).map(|(position_in_world, sigma)| Prior { position_in_world, sigma });
     let camera = Camera { focal_px: args.focal_px, centre_px: args.centre_px, gravity: args.gravity, prior };
@@ -80,8 +80,8 @@ pub fn run(args: LocateArgs) -> Result<(), Failure> {
 
 fn located(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer, Failure> {
     let of_photo = |error: LocateError| match error {
-        LocateError::Version { .. } => Failure::Failed("store", error.into()),
-        error => Failure::Failed("photo", anyhow::anyhow!("{}: {error}", photo.display())),
+        LocateError::Version { .. } => Failure::failed("store", error),
+        error => Failure::failed("photo", anyhow::anyhow!("{}: {error}", photo.display())),
     };
     let bytes = files::read_short(photo, MAX_PHOTO_BYTES as u64)?;
     PhotoFile::open(&bytes)

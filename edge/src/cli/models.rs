@@ -26,7 +26,7 @@ pub fn run(args: ModelsArgs) -> Result<(), Failure> {
         ask: &|question| !args.json && model_commands::ask(question),
     };
     let report = model_commands::run(&args.command, &context);
-    let report = report.map_err(|e| Failure::Failed("models", e.into()))?;
+    let report = report.map_err(|e| Failure::failed("models", e))?;
     match args.json {
         true => print_json(&report),
         false => Ok(write!(io::stdout(), "{report}")?),

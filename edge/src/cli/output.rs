@@ -8,7 +8,7 @@ use super::failure::Failure;
 use super::text::visible;
 
 pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
-    let text = serde_json::to_string(value).map_err(|e| Failure::Failed("json", e.into()))?;
+    let text = serde_json::to_string(value).map_err(|e| Failure::failed("json", e))?;
     Ok(writeln!(io::stdout(), "{text}")?)
 }
 

@@ -1,7 +1,8 @@
 //! `query`.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::Arc;
 
 use crate::query::{
     AnswerKind, Answers, ClusterAnswer, DEFAULT_MIN_COUNT, Format, Found, GaussianAnswer, Negatives,
@@ -14,8 +15,8 @@ use slag_api::coverage::BadCellAnswer;
 use slag_common::frames::Aabb;
 use slag_common::{durable, files, note};
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named};
-use super::failure::{Failure, store_failure};
+use super::args::{EngineArgs, named};
+use super::failure::Failure;
 use super::text::{table, visible};
 
 const EXAMPLES: &str = "Examples:\n\
@@ -64,11 +65,7 @@ pub struct QueryArgs {
     #[arg(long, value_name = "NAME", default_value_t = Precision::Exact)]
     pub precision: Precision,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
     /// Write the Gaussians that answered to a PLY of points: position, score, rank of their answer, and index in
     /// the input splat file where the shards know it.
     #[arg(long, value_name = "FILE")]
@@ -95,31 +92,25 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
         members: args.ply.is_some(),
         ..QueryRequest::new(args.text)
     };
-    request.check().map_err(|e| Failure::Usage(e.into()))?;
+    request.check()?;
     args.ply.iter().try_for_each(|path| files::check_writable(path))?;
-    args.threads.apply()?;
-    let engine = engine(args.cache.open()?, &args.models)?;
-    engine.reload().map_err(store_failure)?;
-    let reply = engine.answer(request, &Budget::default())?;
+    let engine = args.engine.open()?;
+    let reply = Arc::new(engine.on_board()?.answer(request, &Budget::default())?);
     if let Some(path) = &args.ply {
-        write_ply(&reply, path)?;
+        durable::write_result(path, |file| write(Arc::clone(&reply), Format::Ply, file))?;
     }
     match args.json {
-        true => write_json(reply),
-        false => reply.answers().try_for_each(|answers| print_answers(&reply, answers)),
+        true => {
+            let mut out = io::stdout().lock();
+            write(reply, Format::Json, &mut out)?;
+            Ok(writeln!(out)?)
+        }
+        false => reply.answers.iter().try_for_each(|answers| print_answers(&reply, answers)),
     }
 }
 
-fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
-    durable::write_result(path, |file| reply.ply().try_for_each(|piece| Ok(file.write_all(&piece?)?)))
-}
-
-fn write_json(reply: Reply) -> Result<(), Failure> {
-    let mut out = io::stdout().lock();
-    for piece in reply.pieces(Format::Json) {
-        out.write_all(&piece?)?;
-    }
-    Ok(writeln!(out)?)
+fn write(reply: Arc<Reply>, format: Format, mut to: impl Write) -> io::Result<()> {
+    reply.pieces(format).try_for_each(|piece| to.write_all(&piece?))
 }
 
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {

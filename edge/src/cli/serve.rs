@@ -15,7 +15,7 @@ use slag_service::listen::{Listen, answers, bind};
 use slag_service::stop::stop_signal;
 use slag_service::tls::{Tls, TlsFiles};
 
-use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, parse_bytes};
+use super::args::{CacheArgs, DownloadArgs, EngineArgs, engine, parse_bytes};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
 use super::network::parse_store;
@@ -74,18 +74,14 @@ pub struct ServeArgs {
     #[command(flatten)]
     pub following: FollowArgs,
     #[command(flatten)]
-    pub threads: ThreadArgs,
-    #[command(flatten)]
-    pub cache: CacheArgs,
-    #[command(flatten)]
-    pub models: ModelArgs,
+    pub engine: EngineArgs,
 }
 
 pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
-    args.threads.apply()?;
+    args.engine.threads.apply()?;
     let access = access(&mut args)?;
     let tls = tls(&mut args)?;
-    let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
+    let cache = std::mem::replace(&mut args.engine.cache, CacheArgs { cache: None }).open()?;
     if let Some(path) = open_to_everybody(&cache) {
         tracing::warn!(
             "everybody on this machine may write to {path}, and so decide what this robot answers until its next \
@@ -93,7 +89,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
             path = path.display()
         );
     }
-    let engine = engine(cache.clone(), &args.models)?;
+    let engine = engine(cache.clone(), &args.engine.models)?;
     load(&engine);
     let query_timeout = Duration::from_secs(args.max_query_secs);
     let settings = Settings { access, ..Settings::with_budget(args.max_query_bytes, query_timeout) };
@@ -118,7 +114,7 @@ async fn serve(
     settings: Settings,
 ) -> Result<(), Failure> {
     let stop = stop_signal()?;
-    let listener = bind(&args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
+    let listener = bind(&args.listen).await.map_err(|e| Failure::failed("listen", e))?;
     let listener = listener.with_tls(tls);
     // For scripts that let the system choose a port.
     let url = listener.url()?;
@@ -171,10 +167,10 @@ fn tls(args: &mut ServeArgs) -> Result<Option<Tls>, Failure> {
         // One of them may come from the configuration.
         _ => {
             let what = anyhow!("TLS needs both --tls-cert and --tls-key; give both, or neither");
-            return Err(Failure::Usage(what));
+            return Err(Failure::usage(what));
         }
     };
-    args.listen.tls(files).map_err(|e| Failure::Usage(e.into()))
+    args.listen.tls(files).map_err(Failure::usage)
 }
 
 /// Returns a cache folder that every user may write to: answers come from files checked only by hash.
@@ -211,9 +207,9 @@ fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
         origins: std::mem::take(&mut args.cors),
         token_file: args.token_file.take(),
     };
-    let access = Access::new(&args.listen, settings).map_err(|e| Failure::Usage(e.into()))?;
+    let access = Access::new(&args.listen, settings).map_err(Failure::usage)?;
     if args.follow.is_some() && !access.takes_writes() {
-        return Err(Failure::Usage(anyhow!(
+        return Err(Failure::usage(anyhow!(
             "--follow needs positions, and on {} everybody could post them; give --token-file FILE, or listen on \
              127.0.0.1 or unix:PATH",
             args.listen

@@ -8,7 +8,7 @@ use serde::Serialize;
 use slag_common::ByteSize;
 
 use super::args::CacheArgs;
-use super::failure::{Failure, store_failure};
+use super::failure::Failure;
 use super::output::{print_json, print_pairs};
 
 #[derive(Debug, Args)]
@@ -22,7 +22,7 @@ pub struct StatusArgs {
 
 pub fn run(args: StatusArgs) -> Result<(), Failure> {
     let cache = args.cache.open()?;
-    let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
+    let snapshot = Snapshot::open(&cache)?;
     let accepted = accepted(&cache).ok().flatten();
     let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
     let is_expired = expires_unix_secs.is_some_and(|expires| expires <= crate::now_unix_secs());

@@ -10,7 +10,7 @@ use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
 
 use super::args::CacheArgs;
 use super::failure::Failure;
-use super::network::{environment, failure, parse_store};
+use super::network::{environment, parse_store};
 use super::output::{print_json, print_pairs};
 
 #[derive(Debug, Subcommand)]
@@ -93,9 +93,9 @@ fn add(args: AddArgs) -> Result<(), Failure> {
         .map_err(|error| match (error, &args.root) {
             (FetchError::Tuf(error), Some(path)) => {
                 let file = path.display().to_string();
-                Failure::Failed("fetch", anyhow::Error::new(error).context(file))
+                Failure::failed("fetch", anyhow::Error::new(error).context(file))
             }
-            (error, _) => failure(error),
+            (error, _) => error.into(),
         })?;
     if args.json {
         return print_json(&added);
@@ -106,7 +106,7 @@ fn add(args: AddArgs) -> Result<(), Failure> {
 }
 
 fn show(args: ShowArgs) -> Result<(), Failure> {
-    let accepted = accepted(&args.cache.open()?).map_err(|e| failure(e.into()))?;
+    let accepted = accepted(&args.cache.open()?).map_err(FetchError::from)?;
     if args.json {
         return print_json(&accepted);
     }

@@ -15,13 +15,8 @@ pub const MAX_COPY_BYTES: u64 =
     2 * (tuf::MAX_ROOT_BYTES + tuf::MAX_TIMESTAMP_BYTES + tuf::MAX_SNAPSHOT_BYTES) + (64 << 10);
 const NAMES: [&str; 2] = ["0", "1"];
 
-#[derive(Debug, PartialEq, Eq)]
-pub enum Found {
-    Nothing,
-    Record(Version),
-    /// All copies are damaged; the fault of the first.
-    Damaged(String),
-}
+/// The newest version, if there is one; the error: all copies are damaged, by the fault of the first.
+pub type Found = Result<Option<Version>, String>;
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Version {
@@ -72,9 +67,8 @@ impl Copies {
             }
             Err(e) => Copy::Unreadable(e),
         });
-        let version = |sequence, content, index, is_twice| {
-            Ok(Found::Record(Version { sequence, content, index, is_twice }))
-        };
+        let version =
+            |sequence, content, index, is_twice| Ok(Ok(Some(Version { sequence, content, index, is_twice })));
         match (first, second) {
             (Copy::Whole(a, content), Copy::Whole(b, other)) => match a >= b {
                 true => version(a, content.clone(), 0, a == b && content == other),
@@ -83,8 +77,8 @@ impl Copies {
             (Copy::Whole(sequence, content), _) => version(sequence, content, 0, false),
             (_, Copy::Whole(sequence, content)) => version(sequence, content, 1, false),
             (Copy::Unreadable(e), _) | (_, Copy::Unreadable(e)) => Err(e),
-            (Copy::Damaged(what), _) | (_, Copy::Damaged(what)) => Ok(Found::Damaged(what)),
-            (Copy::Missing, Copy::Missing) => Ok(Found::Nothing),
+            (Copy::Damaged(what), _) | (_, Copy::Damaged(what)) => Ok(Err(what)),
+            (Copy::Missing, Copy::Missing) => Ok(Ok(None)),
         }
     }
 
@@ -177,10 +171,8 @@ mod tests {
     }
 
     fn found(copies: &Copies) -> Option<(u64, Vec<u8>, bool)> {
-        match copies.read(&DiskFiles).expect("readable") {
-            Found::Record(version) => Some((version.sequence, version.content, version.is_twice)),
-            _ => None,
-        }
+        let version = copies.read(&DiskFiles).expect("readable").ok().flatten()?;
+        Some((version.sequence, version.content, version.is_twice))
     }
 
     /// Every bit of either copy, every length, and a missing copy.
@@ -203,9 +195,7 @@ mod tests {
             }
             fs_err::remove_file(&path).expect("there");
             assert_eq!(found(&copies), newest, "copy {index} gone");
-            let Found::Record(mut version) = copies.read(&DiskFiles).expect("readable") else {
-                panic!("copy {index}")
-            };
+            let mut version = copies.read(&DiskFiles).expect("readable").expect("whole").expect("there");
             copies.heal(&DiskFiles, &mut version).expect("healed");
             assert_eq!(fs_err::read(&path).expect("there"), whole);
         }
@@ -214,14 +204,14 @@ mod tests {
     #[test]
     fn damage_is_told_from_absence() {
         let (_dir, copies) = written(&[]);
-        assert_eq!(copies.read(&DiskFiles).expect("readable"), Found::Nothing);
+        assert_eq!(copies.read(&DiskFiles).expect("readable"), Ok(None));
         let (_dir, copies) = written(&["x"]);
         for index in [0, 1] {
             fs_err::write(copies.path(index), vec![b'x'; MAX_COPY_BYTES as usize + 1]).expect("written");
         }
-        assert!(matches!(copies.read(&DiskFiles).expect("readable"), Found::Damaged(_)));
+        assert!(copies.read(&DiskFiles).expect("readable").is_err());
         fs_err::remove_file(copies.path(0)).expect("there");
-        assert!(matches!(copies.read(&DiskFiles).expect("readable"), Found::Damaged(_)));
+        assert!(copies.read(&DiskFiles).expect("readable").is_err());
     }
 
     /// Between the two writes the newer copy counts; an older one never does while the newer is whole.

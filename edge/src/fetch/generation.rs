@@ -61,21 +61,11 @@ impl Before<'_> {
     }
 
     fn is_fit(&self, old: &OldShard, new: &Manifest, wanted: &Wanted, cell_id: u32) -> bool {
-        let read;
-        let manifest = match self.offer.filter(|offer| offer.manifest_hash == old.manifest_hash) {
-            Some(offer) => &offer.manifest,
-            None => match self.cache.read_manifest(old.manifest_hash) {
-                Ok(manifest) => {
-                    read = manifest;
-                    &read
-                }
-                Err(_) => return false,
-            },
-        };
+        let Ok(manifest) = self.cache.read_manifest(old.manifest_hash) else { return false };
         let path = self.cache.shard_path(old.hash);
         let cell = CurrentCell { cell_id, hash: old.hash, len_bytes: old.len_bytes };
-        store::can_stand_in(manifest, new, cell_id)
-            && store::check_file(self.cache, &path, &cell, wanted.profile, manifest).is_ok()
+        store::can_stand_in(&manifest, new, cell_id)
+            && store::check_file(self.cache, &path, &cell, wanted.profile, &manifest).is_ok()
     }
 }
 

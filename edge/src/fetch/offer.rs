@@ -36,7 +36,7 @@ impl Offer {
         on_board: Option<&Self>,
     ) -> Result<Self, FetchError> {
         let no_trust = || FetchError::NoTrust { from: client.base.clone() };
-        let mut kept = records.kept().ok_or_else(no_trust)?.clone();
+        let mut kept = records.record.kept.clone().ok_or_else(no_trust)?;
         let mut source = StoreMetadata { client, failure: None };
         let trusted = refresh(&mut kept, &mut source, now_unix_secs);
         // Even before a failure: a root that names new keys must not be forgotten.

@@ -96,19 +96,13 @@ impl FromStr for Position {
                 _ => return Err(refuse()),
             }
         };
-        match spoken {
-            Spoken::World { x, y, z } if [x, y, z].iter().all(|v| v.abs() <= MAX_COORDINATE) => {
-                Ok(Self::World(DVec3::new(x, y, z)))
+        let position = match spoken {
+            Spoken::World { x, y, z } => Self::World(DVec3::new(x, y, z)),
+            Spoken::Geographic { lat, lon, height } => {
+                Self::Geographic { latitude_deg: lat, longitude_deg: lon, height_m: height }
             }
-            Spoken::Geographic { lat, lon, height }
-                if lat.abs() <= 90.0
-                    && lon.abs() <= 180.0
-                    && height.is_none_or(|height| height.abs() <= MAX_COORDINATE) =>
-            {
-                Ok(Self::Geographic { latitude_deg: lat, longitude_deg: lon, height_m: height })
-            }
-            _ => Err(refuse()),
-        }
+        };
+        position.check().map(|()| position).map_err(|_| refuse())
     }
 }
 
@@ -118,21 +112,10 @@ impl Position {
     /// A geographic position without a height gets that of the nearest cell's centre, by horizontal distance to its
     /// box, then to its centre, then by id, so it gets the cells around it wherever the scene's zero height lies.
     pub fn in_world(self, manifest: &Manifest) -> Result<DVec3, PlanError> {
-        let number = |name, value: f64, limit: f64, expected| match value.abs() <= limit {
-            true => Ok(()),
-            false => Err(PlanError::Number { name, value, expected }),
-        };
+        self.check()?;
         match self {
-            Self::World(position) => {
-                for (name, value) in [("x", position.x), ("y", position.y), ("z", position.z)] {
-                    number(name, value, MAX_COORDINATE, "within ±1e9")?;
-                }
-                Ok(position)
-            }
+            Self::World(position) => Ok(position),
             Self::Geographic { latitude_deg, longitude_deg, height_m } => {
-                number("latitude", latitude_deg, 90.0, "within -90..90 degrees")?;
-                number("longitude", longitude_deg, 180.0, "within -180..180 degrees")?;
-                number("height", height_m.unwrap_or(0.0), MAX_COORDINATE, "within ±1e9 metres")?;
                 let geo = manifest
                     .geo_reference
                     .ok_or_else(|| PlanError::NoGeoReference { scene: manifest.scene.clone() })?;
@@ -145,6 +128,25 @@ impl Position {
                     None => at_origin_height.with_z(scene_height(manifest, at_origin_height)),
                 })
             }
+        }
+    }
+}
+
+impl Position {
+    fn check(&self) -> Result<(), PlanError> {
+        let world = |name, value| (name, value, MAX_COORDINATE, "within ±1e9");
+        let numbers = match *self {
+            Self::World(DVec3 { x, y, z }) => [world("x", x), world("y", y), world("z", z)],
+            Self::Geographic { latitude_deg, longitude_deg, height_m } => [
+                ("latitude", latitude_deg, 90.0, "within -90..90 degrees"),
+                ("longitude", longitude_deg, 180.0, "within -180..180 degrees"),
+                ("height", height_m.unwrap_or(0.0), MAX_COORDINATE, "within ±1e9 metres"),
+            ],
+        };
+        let is_out = |value: f64, limit: f64| value.is_nan() || value.abs() > limit;
+        match numbers.into_iter().find(|(_, value, limit, _)| is_out(*value, *limit)) {
+            Some((name, value, _, expected)) => Err(PlanError::Number { name, value, expected }),
+            None => Ok(()),
         }
     }
 }
@@ -209,27 +211,9 @@ mod tests {
         assert_eq!(r#"{"lat":46.8,"lon":-92.0}"#.parse(), Ok(earth(None)));
         assert_eq!(r#"{"lat":46.8,"lon":-92,"height":150}"#.parse(), Ok(earth(Some(150.0))));
         let long = format!("{} 1 1", "1".repeat(300));
-        for bad in [
-            "",
-            "1 2",
-            "1 2 3 4",
-            "1 2 x",
-            "NaN 0 0",
-            "inf 0 0",
-            "91,0",
-            "0,181",
-            "0,0,NaN",
-            "1,2,3,4",
-            ",",
-            "{}",
-            r#"{"x":1,"y":2}"#,
-            r#"{"x":1,"y":2,"z":3,"w":4}"#,
-            r#"{"lat":91,"lon":0}"#,
-            "46.8,-92,1e10",
-            r#"{"lat":46.8,"lon":-92,"height":1e300}"#,
-            "{\"x\":",
-            &long,
-        ] {
+        let bad = r#"; 1 2; 1 2 3 4; 1 2 x; NaN 0 0; inf 0 0; 91,0; 0,181; 0,0,NaN; 1,2,3,4; ,; {}; {"x":1,"y":2};
+            {"x":1,"y":2,"z":3,"w":4}; {"lat":91,"lon":0}; 46.8,-92,1e10; {"lat":46.8,"lon":-92,"height":1e300}; {"x":"#;
+        for bad in bad.split(';').chain([&*long]) {
             assert!(bad.parse::<Position>().is_err(), "{bad}");
         }
         assert!(long.parse::<Position>().expect_err("too long").found.len() <= 80);

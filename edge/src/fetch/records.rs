@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 use slag_common::tuf::{Kept, sha256_hex};
 
-use super::copies::{Copies, Found, MAX_COPY_BYTES, Version};
+use super::copies::{Copies, MAX_COPY_BYTES, Version};
 use super::position::Position;
 use crate::store::EdgeCache;
 use crate::store::files::Stat;
@@ -55,20 +55,20 @@ pub struct Accepted {
 /// The content of the copies, as JSON.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Record {
+pub(super) struct Record {
     /// SHA-256 of the root that was trusted first, hex.
-    first_root_sha256: Option<String>,
-    /// What the client of the metadata keeps.
-    kept: Option<Kept>,
-    scene: Option<String>,
-    last: Option<LastFetch>,
+    pub first_root_sha256: Option<String>,
+    /// What the client of the metadata keeps; absent before the first trust.
+    pub kept: Option<Kept>,
+    pub scene: Option<String>,
+    pub last: Option<LastFetch>,
 }
 
 #[derive(Debug)]
 pub struct Records {
     copies: Copies,
     version: Option<Version>,
-    record: Record,
+    pub(super) record: Record,
     damage: Option<String>,
     _lock: Lock,
 }
@@ -80,11 +80,11 @@ impl Records {
         let lock = Lock::take(cache.dir())?.ok_or_else(busy)?;
         let copies = copies_of(cache);
         cache.create_dir(&copies.dir)?;
-        let (mut version, record, damage) = match read(cache, &copies)? {
-            Read::Nothing => (None, Record::default(), None),
-            Read::Record(version, record) => (Some(version), *record, None),
-            Read::Damaged(what) => (None, Record::default(), Some(what)),
+        let (found, damage) = match read(cache, &copies)? {
+            Ok(found) => (found, None),
+            Err(what) => (None, Some(what)),
         };
+        let (mut version, record) = found.unzip();
         if let Some(version) = &mut version {
             copies.settle(cache.files(), version)?;
             if !version.is_twice {
@@ -98,29 +98,12 @@ impl Records {
                 tracing::warn!("one copy cannot be written anew: {e}");
             }
         }
-        Ok(Self { copies, version, record, damage, _lock: lock })
+        Ok(Self { copies, version, record: record.unwrap_or_default(), damage, _lock: lock })
     }
 
     pub fn damage(&self) -> Option<RecordsError> {
         let what = self.damage.clone()?;
         Some(RecordsError::Damaged { path: self.copies.dir.clone(), what })
-    }
-
-    pub fn last(&self) -> Option<&LastFetch> {
-        self.record.last.as_ref()
-    }
-
-    pub fn scene(&self) -> Option<&str> {
-        self.record.scene.as_deref()
-    }
-
-    /// Returns the metadata accepted; `None` before the first trust.
-    pub fn kept(&self) -> Option<&Kept> {
-        self.record.kept.as_ref()
-    }
-
-    pub(crate) fn first_root_sha256(&self) -> Option<&str> {
-        self.record.first_root_sha256.as_deref()
     }
 
     /// Durably trusts a root, replacing former trust.
@@ -156,11 +139,8 @@ impl Records {
 /// Returns the accepted state, without the lock; `None` before the first trust.
 pub fn accepted(cache: &EdgeCache) -> Result<Option<Accepted>, RecordsError> {
     let copies = copies_of(cache);
-    let Record { scene, kept, .. } = match read(cache, &copies)? {
-        Read::Nothing => return Ok(None),
-        Read::Damaged(what) => return Err(RecordsError::Damaged { path: copies.dir, what }),
-        Read::Record(_, record) => *record,
-    };
+    let found = read(cache, &copies)?.map_err(|what| RecordsError::Damaged { path: copies.dir, what })?;
+    let Some((_, Record { scene, kept, .. })) = found else { return Ok(None) };
     Ok(kept.and_then(|kept| {
         Some(Accepted {
             scene,
@@ -174,10 +154,8 @@ pub fn accepted(cache: &EdgeCache) -> Result<Option<Accepted>, RecordsError> {
 
 /// Returns the position of the last fetch, without the lock.
 pub fn last_position(cache: &EdgeCache) -> Option<Position> {
-    match read(cache, &copies_of(cache)) {
-        Ok(Read::Record(_, record)) => record.last.map(|last| last.at),
-        _ => None,
-    }
+    let (_, record) = read(cache, &copies_of(cache)).ok()?.ok()??;
+    record.last.map(|last| last.at)
 }
 
 /// Returns a value that changes whenever the records do.
@@ -189,22 +167,14 @@ fn copies_of(cache: &EdgeCache) -> Copies {
     Copies::new(cache.dir().join("trust"))
 }
 
-enum Read {
-    Nothing,
-    Record(Version, Box<Record>),
-    Damaged(String),
-}
-
-fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Read> {
-    Ok(match copies.read(cache.files())? {
-        Found::Nothing => Read::Nothing,
-        Found::Damaged(what) => Read::Damaged(what),
-        // A copy of another version of this program counts as damaged.
-        Found::Record(version) => match serde_json::from_slice(&version.content) {
-            Ok(record) => Read::Record(version, Box::new(record)),
-            Err(e) => Read::Damaged(e.to_string()),
-        },
-    })
+/// Reads the newest record, if there is one; the inner error is damage.
+fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Result<Option<(Version, Record)>, String>> {
+    // A copy of another version of this program counts as damaged.
+    let parse = |version: Version| match serde_json::from_slice(&version.content) {
+        Ok(record) => Ok((version, record)),
+        Err(e) => Err(e.to_string()),
+    };
+    Ok(copies.read(cache.files())?.and_then(|found| found.map(parse).transpose()))
 }
 
 /// The cache's lock, held until dropped.
@@ -252,6 +222,6 @@ mod tests {
         let dir = tempfile::tempdir().expect("temporary folder");
         let cache = EdgeCache::open(dir.path());
         Records::open(&cache).expect("opens").keep(&cache, &kept).expect("fits");
-        assert_eq!(Records::open(&cache).expect("opens").kept(), Some(&kept));
+        assert_eq!(Records::open(&cache).expect("opens").record.kept, Some(kept));
     }
 }

@@ -1,6 +1,6 @@
-//! A fetch by phases: each type is a state made only by the previous phase.
+//! A fetch by phases: the cache is locked, an offer accepted, each shard's action decided; then files change.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::time::Instant;
 
@@ -10,7 +10,7 @@ use slag_common::tuf::Kept;
 
 use super::download::Client;
 use super::error::FetchError;
-use super::generation::{Before, assemble};
+use super::generation::{self, Before};
 use super::objects::{Check, Downloaded, download_all};
 use super::offer::Offer;
 use super::plan::{Held, Plan, Wanted};
@@ -35,14 +35,18 @@ pub fn fetch(
     environment: &Environment<'_>,
 ) -> Result<FetchReport, FetchError> {
     let started = Instant::now();
-    let locked = Locked::begin(cache, request, environment)?;
-    let mut report = locked.accept_offer()?.plan()?.download()?.clean_up()?;
-    report.seconds = started.elapsed().as_secs_f64();
-    Ok(report)
+    let mut fetch = Fetch::begin(cache, request, environment)?;
+    let mut planned = fetch.plan()?;
+    let needed_bytes = planned.plan.to_download().bytes;
+    let brought = fetch.make_room(&planned).and_then(|()| fetch.bring(&planned));
+    let (current, downloaded) = brought.map_err(|e| disk_full(e, needed_bytes))?;
+    fetch.clean_up(&mut planned, &current)?;
+    let report = fetch.report(planned, current, &downloaded);
+    Ok(FetchReport { seconds: started.elapsed().as_secs_f64(), ..report })
 }
 
 /// The cache is locked and its content known.
-struct Locked<'a> {
+struct Fetch<'a> {
     cache: &'a EdgeCache,
     request: &'a FetchRequest,
     environment: &'a Environment<'a>,
@@ -54,7 +58,7 @@ struct Locked<'a> {
     on_board: Option<Offer>,
 }
 
-impl<'a> Locked<'a> {
+impl<'a> Fetch<'a> {
     fn begin(
         cache: &'a EdgeCache,
         request: &'a FetchRequest,
@@ -70,7 +74,7 @@ impl<'a> Locked<'a> {
         for dir in dirs.iter().rev() {
             cache.files().sync_dir(dir)?;
         }
-        let last = match (&request.from, request.at, records.last()) {
+        let last = match (&request.from, request.at, &records.record.last) {
             (from, at, Some(last)) => {
                 LastFetch { from: from.as_ref().unwrap_or(&last.from).clone(), at: at.unwrap_or(last.at) }
             }
@@ -103,10 +107,10 @@ impl<'a> Locked<'a> {
         })
     }
 
-    /// Updates metadata and takes its manifest if it is of the robot's scene.
-    fn accept_offer(mut self) -> Result<Offered<'a>, FetchError> {
-        let Self { cache, request, ref client, ref on_board, .. } = self;
-        let records = &mut self.records;
+    /// Updates metadata and takes its manifest if it is of the robot's scene. Returns whether its root was trusted just
+    /// now.
+    fn accept_offer(&mut self) -> Result<(Offer, bool), FetchError> {
+        let Self { cache, request, client, records, on_board, .. } = self;
         if let Some(damage) = records.damage() {
             return Err(damage.into());
         }
@@ -114,25 +118,17 @@ impl<'a> Locked<'a> {
         let now_unix_secs = self.environment.now_unix_secs;
         let offer = Offer::get(client, cache, records, now_unix_secs, on_board.as_ref());
         let offer = offer.map_err(|e| disk_full(e, SPARE_BYTES))?;
-        let known = records.scene().or(on_board.as_ref().map(|offer| offer.manifest.scene.as_str()));
-        offer.check(request.scene.as_deref().or(known))?;
-        Ok(Offered { locked: self, offer, is_first_contact })
+        let of_board = on_board.as_ref().map(|offer| offer.manifest.scene.as_str());
+        offer.check(request.scene.as_deref().or(records.record.scene.as_deref()).or(of_board))?;
+        Ok((offer, is_first_contact))
     }
-}
 
-/// The manifest is accepted.
-struct Offered<'a> {
-    locked: Locked<'a>,
-    offer: Offer,
-    is_first_contact: bool,
-}
-
-impl<'a> Offered<'a> {
     /// Decides what to download, keep and free. Shards marked as damaged are downloaded again, as are those that the
     /// manifest describes otherwise than their own did.
-    fn plan(self) -> Result<Planned<'a>, FetchError> {
-        let Locked { cache, request, usage, last, on_board, .. } = &self.locked;
-        let manifest = &self.offer.manifest;
+    fn plan(&mut self) -> Result<Planned, FetchError> {
+        let (offer, is_first_contact) = self.accept_offer()?;
+        let Self { cache, request, usage, last, on_board, .. } = self;
+        let manifest = &offer.manifest;
         let FetchRequest { profile, radius, max_bytes, .. } = **request;
         let wanted = Wanted { profile, centre_in_world: last.at.in_world(manifest)?, radius, max_bytes };
         let mut held = usage.held_shards(cache)?;
@@ -146,85 +142,57 @@ impl<'a> Offered<'a> {
             held.retain(|hash, _| !unfit.contains(hash));
             plan = Plan::new(manifest, &wanted, &held)?;
         }
-        Ok(Planned { offered: self, wanted, held, plan, marked })
-    }
-}
-
-/// Each shard's action is decided; nothing was removed yet.
-struct Planned<'a> {
-    offered: Offered<'a>,
-    wanted: Wanted,
-    held: std::collections::BTreeMap<Hash32, Held>,
-    plan: Plan,
-    marked: BTreeSet<Hash32>,
-}
-
-impl<'a> Planned<'a> {
-    fn download(mut self) -> Result<Switched<'a>, FetchError> {
-        let needed_bytes = self.plan.to_download().bytes;
-        let switched = self.make_room().and_then(|()| self.bring());
-        let (current, downloaded) = switched.map_err(|e| disk_full(e, needed_bytes))?;
-        Ok(Switched { planned: self, current, downloaded })
+        Ok(Planned { offer, is_first_contact, wanted, held, plan, marked })
     }
 
-    fn make_room(&mut self) -> Result<(), FetchError> {
-        let Offered { locked, offer, .. } = &mut self.offered;
-        let cache = locked.cache;
-        locked.records.accept(cache, &locked.last, &offer.manifest.scene)?;
-        let old_shards = locked.current.iter().flat_map(Current::shards);
+    fn make_room(&mut self, Planned { offer, plan, .. }: &Planned) -> Result<(), FetchError> {
+        let Self { cache, current, on_board, .. } = self;
+        self.records.accept(cache, &self.last, &offer.manifest.scene)?;
+        let old_shards = current.iter().flat_map(Current::shards);
         let in_use: BTreeSet<Hash32> =
-            old_shards.chain(locked.on_board.iter().flat_map(Offer::text_model)).collect();
-        for hash in self.plan.free.difference(&in_use) {
+            old_shards.chain(on_board.iter().flat_map(Offer::text_model)).collect();
+        for hash in plan.free.difference(&in_use) {
             remove(cache, &cache.shard_path(*hash))?;
         }
-        if let (Some(old), Some(on_board)) = (&locked.current, &locked.on_board) {
-            super::generation::remember(
-                cache,
-                old,
-                &on_board.manifest,
-                offer.manifest_hash,
-                &self.plan.cells,
-            );
+        if let (Some(old), Some(on_board)) = (current, on_board) {
+            generation::remember(cache, old, &on_board.manifest, offer.manifest_hash, &plan.cells);
         }
-        clear_staging(cache, &self.plan.download)?;
-        locked.environment.progress.planned(self.plan.to_download().bytes);
-        let manifest_bytes = offer.bytes.len() as u64;
-        let other_bytes = manifest_bytes + self.plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
-        match check_space(cache, &self.plan.download, other_bytes) {
-            Err(_) if super::generation::forget_earlier(cache) => {
-                check_space(cache, &self.plan.download, other_bytes)
-            }
+        clear_staging(cache, &plan.download)?;
+        self.environment.progress.planned(plan.to_download().bytes);
+        let other_bytes = offer.bytes.len() as u64 + plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
+        match check_space(cache, &plan.download, other_bytes) {
+            Err(_) if generation::forget_earlier(cache) => check_space(cache, &plan.download, other_bytes),
             checked => checked,
         }
     }
 
     /// Downloads, and replaces `current`. Unavailable cells are left out.
-    fn bring(&self) -> Result<(Current, Downloaded), FetchError> {
-        let Offered { locked, offer, .. } = &self.offered;
-        let cache = locked.cache;
-        let check = self.check();
-        let parallel = locked.request.parallel;
-        let mut downloaded = download_all(cache, &locked.client, &check, &self.plan.download, parallel)?;
-        damaged::unmark(cache, self.marked.intersection(&downloaded.good))?;
+    fn bring(&self, planned: &Planned) -> Result<(Current, Downloaded), FetchError> {
+        let Self { cache, current: old, on_board, .. } = self;
+        let Planned { offer, wanted, plan, marked, .. } = planned;
+        let check = Check::new(&offer.manifest, wanted.profile, &plan.cells);
+        let parallel = self.request.parallel;
+        let mut downloaded = download_all(cache, &self.client, &check, &plan.download, parallel)?;
+        damaged::unmark(cache, marked.intersection(&downloaded.good))?;
         // Without its text model the new scene would not answer; the one on board does.
         let of_text_model = downloaded.bad.keys().find(|hash| check.is_of_text_model(**hash)).copied();
         if let Some((_, error)) = of_text_model.and_then(|hash| downloaded.bad.remove(&hash)) {
             return Err(error);
         }
-        let before = Before { cache, current: locked.current.as_ref(), offer: locked.on_board.as_ref() };
-        let current = assemble(before, offer, &self.wanted, &self.plan, &downloaded.bad);
+        let before = Before { cache, current: old.as_ref(), offer: on_board.as_ref() };
+        let current = generation::assemble(before, offer, wanted, plan, &downloaded.bad);
         for (hash, (_, error)) in &downloaded.bad {
             let cell_id = check.cell(*hash).map_or(0, |cell| cell.cell_id);
             tracing::warn!("cell {cell_id}: {}", crate::error_line(error));
         }
         if current.cells.is_empty() {
-            let first = self.plan.download.iter().find_map(|object| downloaded.bad.remove(&object.hash));
+            let first = plan.download.iter().find_map(|object| downloaded.bad.remove(&object.hash));
             if let Some((_, error)) = first {
                 return Err(error);
             }
         }
         // Readers reopen the generation if any file was replaced, even the manifest alone.
-        let is_same = locked.current.as_ref() == Some(&current) && locked.on_board.is_some();
+        let is_same = old.as_ref() == Some(&current) && on_board.is_some();
         if !is_same || !downloaded.good.is_empty() {
             put(cache, &offer.bytes, &cache.manifest_path(offer.manifest_hash))?;
             let bytes = serde_json::to_vec(&current).map_err(io::Error::from)?;
@@ -233,38 +201,25 @@ impl<'a> Planned<'a> {
         Ok((current, downloaded))
     }
 
-    fn check(&self) -> Check<'_> {
-        Check::new(&self.offered.offer.manifest, self.wanted.profile, &self.plan.cells)
-    }
-}
-
-struct Switched<'a> {
-    planned: Planned<'a>,
-    current: Current,
-    downloaded: Downloaded,
-}
-
-impl Switched<'_> {
-    fn clean_up(mut self) -> Result<FetchReport, FetchError> {
-        let cache = self.planned.offered.locked.cache;
-        let offer = &self.planned.offered.offer;
-        let in_use: BTreeSet<Hash32> = self.current.shards().chain(offer.text_model()).collect();
-        self.planned.plan.free.retain(|hash| !in_use.contains(hash));
-        for hash in &self.planned.plan.free {
+    fn clean_up(&mut self, planned: &mut Planned, current: &Current) -> Result<(), FetchError> {
+        let cache = self.cache;
+        let Planned { offer, plan, marked, .. } = planned;
+        let in_use: BTreeSet<Hash32> = current.shards().chain(offer.text_model()).collect();
+        plan.free.retain(|hash| !in_use.contains(hash));
+        for hash in &plan.free {
             remove(cache, &cache.shard_path(*hash))?;
         }
-        let old_manifests = self.current.old_shards().map(|(_, old)| old.manifest_hash);
+        let old_manifests = current.old_shards().map(|(_, old)| old.manifest_hash);
         clear_manifests(cache, &old_manifests.chain([offer.manifest_hash]).collect())?;
         clear_staging(cache, &[])?;
-        let on_board = &in_use | &self.planned.plan.spare;
-        damaged::unmark(cache, self.planned.marked.difference(&on_board))?;
-        std::mem::take(&mut self.planned.offered.locked.usage).finish(cache, &in_use, &on_board);
-        Ok(self.report())
+        let on_board = &in_use | &plan.spare;
+        damaged::unmark(cache, marked.difference(&on_board))?;
+        std::mem::take(&mut self.usage).finish(cache, &in_use, &on_board);
+        Ok(())
     }
 
-    fn report(self) -> FetchReport {
-        let Self { planned: Planned { offered, wanted, held, plan, .. }, current, downloaded } = self;
-        let Offered { locked, offer, is_first_contact } = offered;
+    fn report(self, planned: Planned, current: Current, downloaded: &Downloaded) -> FetchReport {
+        let Planned { offer, is_first_contact, wanted, held, plan, .. } = planned;
         let text: BTreeSet<Hash32> = offer.text_model().collect();
         let of_held =
             |hashes: &BTreeSet<Hash32>| Tally::of(hashes.difference(&text).map(|hash| held[hash].len_bytes));
@@ -277,7 +232,7 @@ impl Switched<'_> {
             });
             TextModelTally { bytes: all, downloaded_bytes: new }
         });
-        let (resumed_bytes, retries) = locked.client.resumed_bytes_and_retries();
+        let (resumed_bytes, retries) = self.client.resumed_bytes_and_retries();
         FetchReport {
             text_model,
             downloaded: Tally::of(shards.filter_map(new_bytes)),
@@ -286,7 +241,7 @@ impl Switched<'_> {
             freed: of_held(&plan.free),
             generation: offer.manifest.generation,
             manifest_hash: offer.manifest_hash,
-            root_version: locked.records.kept().and_then(Kept::root_version).unwrap_or(0),
+            root_version: self.records.record.kept.as_ref().and_then(Kept::root_version).unwrap_or(0),
             is_first_contact,
             encoder_id: offer.manifest.encoder.id,
             encoder_name: offer.manifest.encoder.name,
@@ -301,6 +256,16 @@ impl Switched<'_> {
             seconds: 0.0,
         }
     }
+}
+
+/// The manifest is accepted and each shard's action decided; nothing was removed yet.
+struct Planned {
+    offer: Offer,
+    is_first_contact: bool,
+    wanted: Wanted,
+    held: BTreeMap<Hash32, Held>,
+    plan: Plan,
+    marked: BTreeSet<Hash32>,
 }
 
 /// Refuses a download without enough space, before it begins. `other_bytes`: other writes.

@@ -44,10 +44,10 @@ pub fn add_root(
     let (sha256, version) = (sha256_hex(&bytes), kept.root_version().unwrap_or(0));
     cache.create_dir(cache.dir())?;
     let mut records = Records::open(cache)?;
-    let is_new = match records.first_root_sha256() {
-        Some(held) if held == sha256 => false,
+    let is_new = match &records.record.first_root_sha256 {
+        Some(held) if *held == sha256 => false,
         Some(held) if !replace => {
-            return Err(FetchError::OtherRoot { held: held.to_owned(), offered: sha256 });
+            return Err(FetchError::OtherRoot { held: held.clone(), offered: sha256 });
         }
         _ => true,
     };
@@ -62,7 +62,7 @@ pub(super) fn trust_first(
     cache: &EdgeCache,
     records: &mut Records,
 ) -> Result<bool, FetchError> {
-    if records.kept().is_some() {
+    if records.record.kept.is_some() {
         return Ok(false);
     }
     records.trust(cache, Kept::from_root(&first_root(client)?)?)?;

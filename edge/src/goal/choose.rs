@@ -6,10 +6,11 @@ use slag_api::goal::{Goal, NoGoal};
 use slag_math::distance_transform::{FAR, squared_distances};
 
 use super::ground::Floor;
+use super::paths::Paths;
 use super::request::GoalRequest;
 use super::sight;
 use super::space::Window;
-use super::surroundings::Around;
+use super::surroundings::Surroundings;
 
 /// Sample points on a thing's surface: bits of a `u128`.
 const SAMPLES: usize = 128;
@@ -19,8 +20,6 @@ const SQUARE_M: f64 = 0.2;
 const MAX_CANDIDATES: usize = 256;
 /// Most candidates of any square examined if none of those sees the thing, spread over all.
 const MAX_MORE: usize = 2048;
-/// Neighbouring candidates examined in sequence: mostly the same obstacle hides the thing from them.
-const NEIGHBOURS: usize = 64;
 /// Least distance between two poses of a reply, metres.
 const APART_M: f64 = 0.5;
 /// Clearance beyond the robot's radius above which more adds nothing, metres.
@@ -35,28 +34,34 @@ const SIGHT_WEIGHT_M: f64 = 4.0;
 #[derive(Clone, Copy)]
 struct Candidate {
     cell: usize,
+    path_m: f64,
     /// Path and clearance; visibility is not known yet.
     cost_m: f64,
 }
 
 /// Returns the best poses near the thing with a surface at `points`, or why there is none.
-pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) -> Result<Vec<Goal>, NoGoal> {
+pub fn choose(
+    around: &Surroundings<'_>,
+    paths: &Paths,
+    request: &GoalRequest,
+    points: &[DVec3],
+) -> Result<Vec<Goal>, NoGoal> {
     let window = &around.space.window;
     let near = cells_near(window, points, request.stand.reach_m + window.voxel * 0.5f64.sqrt());
-    around.paths.find(near.iter().copied());
-    let around = &*around;
-    let reached: Vec<Candidate> = near.iter().filter_map(|cell| candidate(around, request, *cell)).collect();
+    let candidate = |cell: &usize| {
+        let path_m = paths.to(*cell)? * window.voxel;
+        let spare_m = (around.clearance_m(*cell) - request.robot.radius_m).clamp(0.0, COMFORT_M);
+        let cost_m = path_m + CLEARANCE_WEIGHT_M * (1.0 - spare_m / COMFORT_M);
+        Some(Candidate { cell: *cell, path_m, cost_m })
+    };
+    let reached: Vec<Candidate> = near.iter().filter_map(candidate).collect();
     if reached.is_empty() {
         return Err(missing(around, &near));
     }
     let target = Target::new(around, request, points);
     let looked_at = |candidates: Vec<Candidate>| -> Vec<Look> {
-        let of_piece = |piece: &[Candidate]| {
-            let mut hints = [sight::Hint::NONE; SAMPLES];
-            let piece = if around.goes_on() { piece } else { &[] };
-            piece.iter().filter_map(|of| look(around, request, &target, &mut hints, *of)).collect::<Vec<_>>()
-        };
-        candidates.par_chunks(NEIGHBOURS).flat_map_iter(of_piece).collect()
+        let look = |of| around.budget.goes_on().then(|| look(around, request, &target, of)).flatten();
+        candidates.into_par_iter().filter_map(look).collect()
     };
     let mut looks = looked_at(sifted(window, reached.clone()));
     // Over the edge of a table, the thing on it is often seen only from a strip that is narrower than a square.
@@ -81,7 +86,7 @@ pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) 
             best.push(look);
         }
     }
-    Ok(best.iter().filter_map(|look| goal(around, &target, look)).collect())
+    Ok(best.iter().map(|look| goal(around, &target, look)).collect())
 }
 
 fn place(look: &Look) -> f64 {
@@ -118,12 +123,6 @@ fn cells_near(window: &Window, points: &[DVec3], distance: f64) -> Vec<usize> {
         .collect()
 }
 
-fn candidate(around: &Around<'_>, request: &GoalRequest, cell: usize) -> Option<Candidate> {
-    let path_m = around.paths.to(cell)? * around.space.window.voxel;
-    let spare_m = (around.clearance(cell) - request.robot.radius_m).clamp(0.0, COMFORT_M);
-    Some(Candidate { cell, cost_m: path_m + CLEARANCE_WEIGHT_M * (1.0 - spare_m / COMFORT_M) })
-}
-
 /// Returns the cheapest candidate of each square, and of those at most [`MAX_CANDIDATES`].
 fn sifted(window: &Window, candidates: Vec<Candidate>) -> Vec<Candidate> {
     let square = (SQUARE_M / window.voxel).round().max(1.0) as usize;
@@ -149,10 +148,10 @@ struct Target<'a> {
 }
 
 impl<'a> Target<'a> {
-    fn new(around: &Around<'a>, request: &GoalRequest, points: &'a [DVec3]) -> Self {
+    fn new(around: &'a Surroundings<'_>, request: &GoalRequest, points: &'a [DVec3]) -> Self {
         let step = points.len().div_ceil(SAMPLES).max(1);
         let samples = points.iter().copied().step_by(step).collect();
-        Self { points, samples, thing: sight::Thing::new(around.space, points, request.stand.reach_m) }
+        Self { points, samples, thing: sight::Thing::new(&around.space, points, request.stand.reach_m) }
     }
 
     fn distance(points: &[DVec3], [x, y]: [f64; 2]) -> f64 {
@@ -177,12 +176,11 @@ struct Look {
     cost_m: f64,
 }
 
-/// Looks at the thing from a candidate; `None` if the thing is out of reach after all. `hints`: by sample.
+/// Looks at the thing from a candidate; `None` if the thing is out of reach after all.
 fn look(
-    around: &Around<'_>,
+    around: &Surroundings<'_>,
     request: &GoalRequest,
     target: &Target<'_>,
-    hints: &mut [sight::Hint; SAMPLES],
     of: Candidate,
 ) -> Option<Look> {
     let [x, y] = around.space.window.centre_of(of.cell);
@@ -194,36 +192,36 @@ fn look(
     let sensor_in_world = position_in_world + DVec3::Z * request.robot.sensor_height_m;
     let voxel = around.space.window.voxel_of(sensor_in_world);
     let mut seen = 0u128;
-    for ((bit, point), hint) in (0..).zip(&target.samples).zip(hints) {
-        seen |= u128::from(sight::sees(&target.thing, sensor_in_world, voxel, *point, hint)) << bit;
+    for (bit, point) in (0..).zip(&target.samples) {
+        seen |= u128::from(sight::sees(&target.thing, sensor_in_world, voxel, *point)) << bit;
     }
     let visible_share = f64::from(seen.count_ones()) / target.samples.len() as f64;
     let cost_m = of.cost_m + SIGHT_WEIGHT_M * (1.0 - visible_share);
     Some(Look { of, position_in_world, sensor_in_world, seen, visible_share, cost_m })
 }
 
-fn goal(around: &Around<'_>, target: &Target<'_>, look: &Look) -> Option<Goal> {
+fn goal(around: &Surroundings<'_>, target: &Target<'_>, look: &Look) -> Goal {
     let Look { of, position_in_world, sensor_in_world, seen, visible_share, cost_m } = *look;
     let [x, y] = [position_in_world.x, position_in_world.y];
     let points = (0..).zip(&target.samples).filter(|(bit, _)| seen >> bit & 1 != 0).map(|(_, point)| point);
     let middle = points.sum::<DVec3>() / f64::from(seen.count_ones());
     let yaw_rad = (middle.y - y).atan2(middle.x - x);
-    Some(Goal {
+    Goal {
         position_in_world,
         geographic: None,
         yaw_rad,
         orientation_xyzw: [0.0, 0.0, (yaw_rad / 2.0).sin(), (yaw_rad / 2.0).cos()],
         sensor_in_world,
-        clearance_m: around.clearance(of.cell),
+        clearance_m: around.clearance_m(of.cell),
         visible_share,
-        path_m: around.paths.to(of.cell)? * around.space.window.voxel,
+        path_m: of.path_m,
         distance_m: Target::distance(target.points, [x, y]),
         cost_m,
-    })
+    }
 }
 
 /// Returns why no path leads to any of the cells near a thing.
-fn missing(around: &Around<'_>, near: &[usize]) -> NoGoal {
+fn missing(around: &Surroundings<'_>, near: &[usize]) -> NoGoal {
     let n_unknown = near.iter().filter(|cell| around.ground.floors[**cell] == Floor::Unknown).count();
     if near.is_empty() || 2 * n_unknown > near.len() { NoGoal::UnknownGround } else { NoGoal::Unreachable }
 }

@@ -7,9 +7,8 @@ use slag_common::objects::{parse_public_id, public_id};
 use super::choose::choose;
 use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings};
-use crate::query::{Ask, ClusterAnswer, Engine, Found, OnBoard, Outcome, Point, coverage};
+use crate::query::{ClusterAnswer, Found, OnBoard, QueryRequest, Scene, coverage};
 use crate::score::{Budget, Region};
-use crate::store::Snapshot;
 
 const MAX_THINGS: usize = 5;
 const MAX_POINTS: usize = 4096;
@@ -18,17 +17,12 @@ const MAX_POINTS: usize = 4096;
 ///
 /// # Errors
 /// [`GoalError`]. That there is no such place is a reply.
-pub fn find(
-    engine: &Engine,
-    on_board: &OnBoard,
-    request: &GoalRequest,
-    budget: &Budget,
-) -> Result<GoalReply, GoalError> {
+pub fn find(on_board: &OnBoard, request: &GoalRequest, budget: &Budget) -> Result<GoalReply, GoalError> {
     request.check()?;
     let snapshot = &on_board.snapshot;
     let manifest = &snapshot.manifest;
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
-    let things = match things(engine, on_board, request, near, budget)? {
+    let things = match things(on_board, request, near, budget)? {
         Ok(things) => things,
         Err(detail) => {
             let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, 0.0, near);
@@ -48,16 +42,16 @@ pub fn find(
         reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });
         return Ok(reply);
     };
-    let mut around = seen.around(start);
+    let (paths, scene) = (seen.paths_from(start), Scene::of(snapshot));
     for (shape, thing) in things {
         let points = match shape {
-            Shape::Object(id) => engine.object_points(snapshot, id, MAX_POINTS, budget),
-            Shape::Group(group) => engine.answer_points(snapshot, &group, MAX_POINTS, budget),
+            Shape::Object(id) => scene.object_points(id, MAX_POINTS, budget),
+            Shape::Group(group) => scene.answer_points(&group, MAX_POINTS, budget),
         };
-        budget.check().map_err(GoalError::spent)?;
-        let chosen = choose(&mut around, request, &points);
+        budget.check()?;
+        let chosen = choose(&seen, &paths, request, &points);
         // Looks end early once the budget is spent.
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         match chosen {
             Ok(mut goals) => {
                 for goal in &mut goals {
@@ -104,7 +98,6 @@ type Things = Vec<(Shape, TargetThing)>;
 
 /// Returns the things to go to, best first, or why there is none.
 fn things(
-    engine: &Engine,
     on_board: &OnBoard,
     request: &GoalRequest,
     near: DVec3,
@@ -115,13 +108,13 @@ fn things(
             if on_board.snapshot.objects.is_empty() {
                 return Err(GoalError::NoObjects);
             }
-            let Some(object) = engine.object(&on_board.snapshot, None, *id, budget)? else {
-                let generation = on_board.snapshot.manifest.generation;
-                let Snapshot { manifest, bad_cells, current, .. } = &*on_board.snapshot;
-                let fetched = (current.centre_in_world, current.radius);
-                let missing = coverage(manifest, bad_cells, fetched, &Region::default()).missing();
+            let scene = Scene::of(&on_board.snapshot);
+            let found = scene.object(*id, None, budget);
+            budget.check()?;
+            let Some(object) = found else {
+                let missing = coverage(&scene, &Region::default()).missing();
                 let missing = missing.map(|missing| format!("; {missing}")).unwrap_or_default();
-                let id = public_id(*id);
+                let (generation, id) = (scene.manifest.generation, public_id(*id));
                 return Ok(Err(format!("generation {generation} has no object {id} on board{missing}")));
             };
             let thing =
@@ -130,21 +123,16 @@ fn things(
         }
         GoalTarget::Text(text) => text,
     };
-    let near = Some(Point::World(near.to_array()));
-    let (texts, heading_rad) = (vec![text.clone()], request.heading_rad);
-    let ask = Ask { texts, near, heading_rad, limit: Some(MAX_THINGS), ..Ask::default() };
-    let found = engine.ask_for_members(on_board, ask, budget)?;
-    let (answers, none) = match found.outcomes.into_iter().next() {
-        Some(Outcome::Plain(plain)) => {
-            let Found::Clusters(answers) = plain.answers else { return Ok(Ok(Vec::new())) };
-            (answers, plain.reason.map(|reason| reason.detail))
-        }
-        Some(Outcome::Related(related)) => {
-            let answers = related.answers.into_iter().map(|(answer, ..)| answer).collect();
-            (answers, related.miss.map(|miss| miss.detail))
-        }
-        None => (Vec::new(), None),
+    let request = QueryRequest {
+        near: Some(near),
+        heading_rad: request.heading_rad,
+        limit: Some(MAX_THINGS),
+        members: true,
+        ..QueryRequest::new(text)
     };
+    let found = on_board.answer(request, budget)?.answers.remove(0);
+    let none = found.reason.map(|reason| reason.detail);
+    let Found::Clusters(answers) = found.answers else { return Ok(Ok(Vec::new())) };
     if answers.is_empty() {
         return Ok(Err(none.unwrap_or_else(|| "nothing on board matches".to_owned())));
     }
@@ -157,5 +145,5 @@ fn things(
         let shape = parse_public_id(&answer.id).map_or_else(|| Shape::Group(Box::new(answer)), Shape::Object);
         (shape, thing)
     };
-    Ok(Ok(answers.into_iter().take(MAX_THINGS).map(thing).collect()))
+    Ok(Ok(answers.into_iter().map(thing).collect()))
 }

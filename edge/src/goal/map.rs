@@ -6,7 +6,6 @@ use glam::DVec3;
 use slag_api::floor::Place;
 
 use super::ground::Floor;
-use super::paths::Paths;
 use super::request::{GoalError, GoalRequest};
 use super::surroundings::Surroundings;
 use crate::score::Budget;
@@ -28,12 +27,8 @@ pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) ->
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
     let seen = Surroundings::look(snapshot, request, near, budget)?;
     let start = seen.start(near, request.robot.radius_m);
-    let paths = start.map(|start| {
-        let mut paths = Paths::from(start, &seen.is_safe, &seen.ground, seen.step);
-        paths.find(0..seen.is_safe.len());
-        paths
-    });
-    budget.check().map_err(GoalError::spent)?;
+    let paths = start.map(|start| seen.paths_from(start));
+    budget.check()?;
     let window = &seen.space.window;
     let [n_x, n_y] = window.cells();
     let place = |x: usize, y: usize| {

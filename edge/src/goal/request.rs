@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use crate::query::{QueryError, RequestError};
-use crate::score::{OverBudget, ScoreError};
+use crate::score::OverBudget;
 
 pub const RADIUS_M: [f64; 2] = [0.05, 2.0];
 pub const REACH_M: [f64; 2] = [0.0, 10.0];
@@ -177,11 +177,13 @@ impl From<RequestError> for GoalError {
     }
 }
 
-impl GoalError {
-    pub(super) fn spent(error: OverBudget) -> Self {
-        Self::Query(ScoreError::from(error).into())
+impl From<OverBudget> for GoalError {
+    fn from(error: OverBudget) -> Self {
+        Self::Query(error.into())
     }
+}
 
+impl GoalError {
     /// Returns the stable name of the error's kind, for programs.
     pub fn kind(&self) -> &'static str {
         match self {

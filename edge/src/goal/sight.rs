@@ -11,10 +11,6 @@ use super::space::{COLUMN_BLOCKS, Space};
 /// Distance from a point of the thing within which the line need not be free, in edges of a voxel: the
 /// thing's own surface and the voxels just before it are occupied or unknown.
 const TOLERANCE: f64 = 2.0;
-/// Distance from a voxel's sides, in edges, from which a place surely lies inside: more than rounding moves one.
-const SIDE: f64 = 1e-3;
-/// Distance from a point, in edges of a voxel, beyond which a place is outside its [`TOLERANCE`].
-const BEFORE: f64 = TOLERANCE + SIDE;
 const HEIGHT: i32 = COLUMN_BLOCKS * BLOCK_EDGE;
 /// Most columns of voxels in the local table, 17 MB; lines to larger things look up every voxel.
 const MAX_AT_HAND: usize = 1 << 19;
@@ -129,17 +125,13 @@ fn place(at: [i32; 3]) -> ([i32; 3], u64) {
 /// A sensor below the whole thing looks at the board or table that carries it. Their highest voxels belong to
 /// both, so only voxels wholly above the thing's bottom count as its own.
 ///
-/// Voxel traversal: Amanatides and Woo, "A Fast Voxel Traversal Algorithm" (1987). `hint` is tried first and
-/// updated; it changes no result.
-pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3, hint: &mut Hint) -> bool {
+/// Voxel traversal: Amanatides and Woo, "A Fast Voxel Traversal Algorithm" (1987).
+pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3) -> bool {
     let window = &thing.space.window;
     let voxel = window.voxel;
     let line = point - sensor;
     let lowest = if sensor.z < thing.bottom { thing.first_above_bottom } else { i32::MIN };
     let corner = DVec3::from(window.first.map(|b| f64::from(b * BLOCK_EDGE))) * voxel;
-    if hint.hides(thing, line, point - corner, lowest) {
-        return false;
-    }
     let length = line.length();
     if length <= 0.0 {
         return true;
@@ -155,7 +147,7 @@ pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3, hint: 
         }
     }
     let step = direction.to_array().map(|along| if along > 0.0 { 1 } else { -1 });
-    let mut walk = Walk { at, axis: 0, entered: 0.0, next, between, step };
+    let mut walk = Walk { at, entered: 0.0, next, between, step };
     let mut is_at_thing = false;
     loop {
         let is_free = thing.is_free(walk.at);
@@ -163,7 +155,6 @@ pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3, hint: 
             is_at_thing = true;
             let is_near = walk.entered >= length - TOLERANCE * voxel || thing.may_occupy(walk.at);
             if !is_near || !is_free && walk.at[2] < lowest {
-                *hint = Hint { axis: walk.axis, plane: f64::from(walk.at[walk.axis]) + 0.5 };
                 return false;
             }
         }
@@ -174,39 +165,8 @@ pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3, hint: 
     }
 }
 
-/// The plane that last hid a point: it often hides it from the next place, too.
-#[derive(Clone, Copy)]
-pub struct Hint {
-    axis: usize,
-    /// Position of the plane along the axis, in voxels from the window's corner.
-    plane: f64,
-}
-
-impl Hint {
-    pub const NONE: Self = Self { axis: 0, plane: f64::NAN };
-
-    /// Returns whether the voxel in which a line to a point meets the plane surely hides the point. `line`:
-    /// from the sensor; `point`: from the window's corner.
-    fn hides(self, thing: &Thing<'_>, line: DVec3, point: DVec3, lowest: i32) -> bool {
-        let per_voxel = 1.0 / thing.space.window.voxel;
-        let (line, point) = (line * per_voxel, point * per_voxel);
-        let share = (point[self.axis] - self.plane) / line[self.axis];
-        let is_before = share < 1.0 && share > 0.0 && share * share * line.length_squared() > BEFORE * BEFORE;
-        let place = point - line * share;
-        let voxel = place.as_ivec3();
-        let inside = place - voxel.as_dvec3();
-        if !is_before || inside.min_element() < SIDE || inside.max_element() > 1.0 - SIDE {
-            return false;
-        }
-        let at = voxel.to_array();
-        !thing.is_free(at) && (at[2] < lowest || !thing.may_occupy(at))
-    }
-}
-
 struct Walk {
     at: [i32; 3],
-    /// Axis along which it entered the voxel.
-    axis: usize,
     /// Distances along the line: to the voxel's entry, to the next side across each axis, and between two sides.
     entered: f64,
     next: [f64; 3],
@@ -228,7 +188,6 @@ impl Walk {
     #[inline(always)]
     fn pass(&mut self, axis: usize) {
         self.entered = self.next[axis];
-        self.axis = axis;
         self.at[axis] += self.step[axis];
         self.next[axis] += self.between[axis];
     }
@@ -278,42 +237,5 @@ mod tests {
                 assert_eq!(thing.may_occupy(at), is_own, "{at:?}");
             }
         }
-    }
-
-    /// Oracle: the line alone, without a hint.
-    #[test]
-    fn hints_change_no_result() {
-        let mut random = Random::new(9);
-        let window = Window::around(DVec3::ZERO, 1.0, 0.1);
-        let all = (-3..3).flat_map(|x| (-3..3).flat_map(move |y| (-8..30).map(move |z| [x, y, z])));
-        let mut mostly_free = || (0..4).fold(0, |free, _| free | random.bits());
-        let blocks: Vec<Block> = all.map(|at| Block { at, occupied: 0, free: mostly_free() }).collect();
-        let packed = BuiltOccupancy::pack(0.1, 0.1, 2, &blocks);
-        let space = Space::gather(window, &[packed.view()], &Budget::default()).expect("few blocks");
-        let (mut n_seen, mut n_hidden, mut n_at_once) = (0, 0, 0);
-        for _ in 0..40 {
-            let mut somewhere = |far: f64| DVec3::from([0; 3].map(|_| random.between(-far, far)));
-            let centre = somewhere(0.6);
-            let points: Vec<DVec3> = (0..9).map(|_| centre + somewhere(0.3)).collect();
-            let thing = Thing::new(&space, &points, 0.5);
-            // Sensors also beyond the window, at the point itself, and straight below it.
-            let mut sensors: Vec<DVec3> = (0..30).map(|_| somewhere(1.4)).collect();
-            sensors.extend([points[0], points[0] - DVec3::Z * 0.5]);
-            let mut hint = Hint::NONE;
-            for (sensor, point) in sensors.iter().flat_map(|sensor| points.iter().map(move |p| (*sensor, *p)))
-            {
-                let at = window.voxel_of(sensor);
-                let expected = sees(&thing, sensor, at, point, &mut { Hint::NONE });
-                let planes = (0..3).flat_map(|axis| (-4..64).map(move |half| (axis, f64::from(half) / 2.0)));
-                for (axis, plane) in planes {
-                    let mut hint = Hint { axis, plane };
-                    assert_eq!(sees(&thing, sensor, at, point, &mut hint), expected, "{axis} {plane}");
-                    n_at_once += u32::from(!expected && (hint.axis, hint.plane) == (axis, plane));
-                }
-                assert_eq!(sees(&thing, sensor, at, point, &mut hint), expected);
-                *(if expected { &mut n_seen } else { &mut n_hidden }) += 1;
-            }
-        }
-        assert!(n_seen > 1000 && n_hidden > 1000 && n_at_once > 10_000, "{n_seen} {n_hidden} {n_at_once}");
     }
 }

@@ -22,34 +22,6 @@ const MAX_HEIGHT_M: f64 = 1.5;
 /// Bytes per cell, over all steps.
 const CELL_BYTES: usize = 36;
 
-pub struct Around<'a> {
-    pub space: &'a Space,
-    pub ground: &'a Ground,
-    pub paths: Paths,
-    clearance: &'a Clearance,
-    budget: &'a Budget,
-}
-
-impl Around<'_> {
-    pub(crate) fn clearance(&self, cell: usize) -> f64 {
-        f64::from(self.clearance.squared(cell)).sqrt() * self.space.window.voxel
-    }
-
-    pub fn goes_on(&self) -> bool {
-        self.budget.goes_on()
-    }
-
-    pub(crate) fn floor_height(&self, cell: usize) -> Option<f64> {
-        match self.ground.floors[cell] {
-            Floor::At(z) => {
-                let window = &self.space.window;
-                Some(window.height_of(i32::from(z) + 1) - SURFACE_DEPTH * window.voxel)
-            }
-            _ => None,
-        }
-    }
-}
-
 /// The ground and the obstacles.
 pub(super) struct Surroundings<'a> {
     pub(super) space: Space,
@@ -58,8 +30,8 @@ pub(super) struct Surroundings<'a> {
     is_continued: Vec<bool>,
     pub(super) clearance: Clearance,
     pub(super) is_safe: Vec<bool>,
-    pub(super) step: u8,
-    budget: &'a Budget,
+    step: u8,
+    pub(super) budget: &'a Budget,
 }
 
 /// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`] away. A
@@ -135,9 +107,9 @@ impl<'a> Surroundings<'a> {
         let step = (step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
         let window = Window::around(near, request.robot.range_m, voxel);
         budget.take(window.cells().iter().product::<usize>() * CELL_BYTES);
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         let gathered = Space::gather(window, occupancies, budget);
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         let space = gathered
             .ok_or_else(|| too_far("a smaller range: there are more than 8 million blocks".into()))?;
         // A column has 128 voxels, so no higher robot has headroom.
@@ -148,20 +120,29 @@ impl<'a> Surroundings<'a> {
             None => vec![false; ground.floors.len()],
         };
         ground.block_slopes(request.robot.slope, step, voxel);
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         let obstacles = clearance::obstacles(&ground, step);
         let clearance = Clearance::new(&obstacles, ground.n_y);
         let least = (request.robot.radius_m / voxel).powi(2).ceil() as u32;
         let is_safe = clearance.at_least(least.max(1));
-        budget.check().map_err(GoalError::spent)?;
+        budget.check()?;
         Ok(Self { space, ground, is_continued, clearance, is_safe, step, budget })
     }
 
-    /// Begins the paths from a safe cell.
-    pub(super) fn around(&self, start: usize) -> Around<'_> {
-        let paths = Paths::from(start, &self.is_safe, &self.ground, self.step);
-        let (space, ground, clearance) = (&self.space, &self.ground, &self.clearance);
-        Around { space, ground, paths, clearance, budget: self.budget }
+    /// Finds the paths from a safe cell.
+    pub(super) fn paths_from(&self, start: usize) -> Paths {
+        Paths::from(start, &self.is_safe, &self.ground, self.step)
+    }
+
+    /// Returns the distance of a cell's middle to what the robot must not touch, metres.
+    pub(super) fn clearance_m(&self, cell: usize) -> f64 {
+        f64::from(self.clearance.squared(cell)).sqrt() * self.space.window.voxel
+    }
+
+    pub(super) fn floor_height(&self, cell: usize) -> Option<f64> {
+        let Floor::At(z) = self.ground.floors[cell] else { return None };
+        let window = &self.space.window;
+        Some(window.height_of(i32::from(z) + 1) - SURFACE_DEPTH * window.voxel)
     }
 
     /// Returns the safe cell nearest to the robot on its own ground, at most [`START_M`] or its radius away.

@@ -83,7 +83,7 @@ fn stand(
     let (request, budget) = (&GoalRequest { near: Some(near), ..request.clone() }, Budget::default());
     let seen = Surroundings::of(&[world.view()], request, near, &budget).expect("places are known");
     let start = seen.start(near, request.robot.radius_m).ok_or(NoGoal::UnknownGround)?;
-    choose(&mut seen.around(start), request, points)
+    choose(&seen, &seen.paths_from(start), request, points)
 }
 
 fn goals_with(world: &BuiltOccupancy, request: &GoalRequest) -> Result<Vec<Goal>, NoGoal> {

@@ -1,11 +1,11 @@
 //! Background work of the service: a follower, restarted after a panic, and a scrubber, which finds rot early.
 
-use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use slag_common::retry::Backoff;
+use slag_service::request::panic_text;
 
 use super::app::App;
 use crate::fetch::follow::Following;
@@ -31,7 +31,7 @@ pub fn keep_following<T>(
             Ok(ended) => return Some(ended),
             Err(panic) => panic,
         };
-        let failure = format!("the follower panicked: {}", text_of(&*panic));
+        let failure = format!("the follower panicked: {}", panic_text(&*panic));
         let n_in_a_row = following.note_failure(&failure);
         let pause = restarts.after(u32::try_from(n_in_a_row).unwrap_or(u32::MAX));
         tracing::error!("{failure}; it begins again in {} s", pause.as_secs_f64());
@@ -40,11 +40,6 @@ pub fn keep_following<T>(
         }
         following.note_restart();
     }
-}
-
-fn text_of(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<&str>().copied().or(panic.downcast_ref::<String>().map(String::as_str));
-    text.unwrap_or("without a message")
 }
 
 /// Pause while no scene is loaded.

@@ -19,18 +19,16 @@ const RETRY_SECS: u32 = 1;
 /// `Retry-After` while a failed follower restarts.
 const FOLLOWER_RETRY_SECS: u32 = 5;
 
-pub const SCENE: [(u16, &str); 2] = [
-    (500, "The service failed."),
-    (
-        503,
-        "No scene is loaded, too much is asked at once, or the answer took too long; Retry-After has the pause before the next attempt.",
-    ),
-];
+/// Errors of routes that read the scene.
+pub const FAILED: (u16, &str) = (500, "The service failed.");
+pub const NO_SCENE: (u16, &str) = (
+    503,
+    "No scene is loaded, too much is asked at once, or the answer took too long; Retry-After has the pause before the next attempt.",
+);
 /// Errors of routes that use the text model.
-pub const TEXTS: [(u16, &str); 2] = [
-    (409, "The text model does not fit the scene."),
-    (422, "The text model does not know the words, or the answer needs more memory or time than its budget."),
-];
+pub const OTHER_MODEL: (u16, &str) = (409, "The text model does not fit the scene.");
+pub const WORDS: (u16, &str) =
+    (422, "The text model does not know the words, or the answer needs more memory or time than its budget.");
 /// Error of routes that take a time budget.
 pub const TIME_BUDGET: (u16, &str) = (504, "The time that the request gives is spent.");
 /// Error of routes with a budget of memory and time.
@@ -99,58 +97,70 @@ pub fn follower_failed(failure: &str) -> Problem {
         .retry_after(FOLLOWER_RETRY_SECS)
 }
 
-pub fn query_problem(error: QueryError) -> Problem {
-    let (kind, detail) = (error.kind(), error.to_string());
-    let unavailable = |title| {
-        Problem::new(StatusCode::SERVICE_UNAVAILABLE, kind, title, detail.clone()).retry_after(RETRY_SECS)
-    };
-    let parameter = if matches!(error, QueryError::Negatives(_)) { "negatives" } else { "text" };
-    let unknown_words = |found: String, expected: String, suggestions: Vec<String>| {
-        Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Unknown words", detail.clone()).with(&Members {
-            parameter: ParameterMembers {
-                parameter: Some(parameter.into()),
-                found: Some(found),
-                expected: Some(expected),
-            },
-            suggestions: Some(suggestions),
-            ..Members::default()
-        })
-    };
-    match error {
-        QueryError::Request(error) => error.into(),
-        QueryError::NoScene => unavailable("No scene"),
-        QueryError::Text(TextError::Busy) | QueryError::Negatives(TextError::Busy) => {
-            unavailable("Overloaded")
-        }
-        QueryError::Score(ScoreError::OverBudget(OverBudget::Together { .. })) => unavailable("Overloaded"),
-        QueryError::Score(ScoreError::OverBudget(_)) => {
-            Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Over budget", detail)
-        }
-        QueryError::EncoderMismatch { models_name, models_id, scene_name, scene_id } => {
-            Problem::new(StatusCode::CONFLICT, kind, "Text model does not fit the scene", detail).with(
+impl From<OverBudget> for Problem {
+    fn from(error: OverBudget) -> Self {
+        QueryError::from(error).into()
+    }
+}
+
+impl From<QueryError> for Problem {
+    fn from(error: QueryError) -> Self {
+        let (kind, detail) = (error.kind(), error.to_string());
+        let unavailable = |title| {
+            Problem::new(StatusCode::SERVICE_UNAVAILABLE, kind, title, detail.clone()).retry_after(RETRY_SECS)
+        };
+        let parameter = if matches!(error, QueryError::Negatives(_)) { "negatives" } else { "text" };
+        let unknown_words = |found: String, expected: String, suggestions: Vec<String>| {
+            Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Unknown words", detail.clone()).with(
                 &Members {
-                    models: Some(EncoderName { name: models_name, id: models_id }),
-                    scene: Some(EncoderName { name: scene_name, id: scene_id }),
+                    parameter: ParameterMembers {
+                        parameter: Some(parameter.into()),
+                        found: Some(found),
+                        expected: Some(expected),
+                    },
+                    suggestions: Some(suggestions),
                     ..Members::default()
                 },
             )
-        }
-        QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
-            match error {
-                InferenceError::EmptyText => {
-                    RequestError::new(parameter, "nothing to look for", "words to look for").into()
-                }
-                InferenceError::UnknownPhrase { text, n_known, near } => {
-                    unknown_words(text, format!("one of {n_known} phrases"), near)
-                }
-                InferenceError::UnknownWords { unknown, known } => {
-                    unknown_words(unknown.join(", "), "words that the model knows".into(), known)
-                }
-                _ => Problem::internal(&detail),
+        };
+        match error {
+            QueryError::Request(error) => error.into(),
+            QueryError::NoScene => unavailable("No scene"),
+            QueryError::Text(TextError::Busy) | QueryError::Negatives(TextError::Busy) => {
+                unavailable("Overloaded")
             }
+            QueryError::Score(ScoreError::OverBudget(OverBudget::Together { .. })) => {
+                unavailable("Overloaded")
+            }
+            QueryError::Score(ScoreError::OverBudget(_)) => {
+                Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Over budget", detail)
+            }
+            QueryError::EncoderMismatch { models_name, models_id, scene_name, scene_id } => {
+                Problem::new(StatusCode::CONFLICT, kind, "Text model does not fit the scene", detail).with(
+                    &Members {
+                        models: Some(EncoderName { name: models_name, id: models_id }),
+                        scene: Some(EncoderName { name: scene_name, id: scene_id }),
+                        ..Members::default()
+                    },
+                )
+            }
+            QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
+                match error {
+                    InferenceError::EmptyText => {
+                        RequestError::new(parameter, "nothing to look for", "words to look for").into()
+                    }
+                    InferenceError::UnknownPhrase { text, n_known, near } => {
+                        unknown_words(text, format!("one of {n_known} phrases"), near)
+                    }
+                    InferenceError::UnknownWords { unknown, known } => {
+                        unknown_words(unknown.join(", "), "words that the model knows".into(), known)
+                    }
+                    _ => Problem::internal(&detail),
+                }
+            }
+            QueryError::Text(TextError::Stopped)
+            | QueryError::Negatives(TextError::Stopped)
+            | QueryError::Score(_) => Problem::internal(&detail),
         }
-        QueryError::Text(TextError::Stopped)
-        | QueryError::Negatives(TextError::Stopped)
-        | QueryError::Score(_) => Problem::internal(&detail),
     }
 }

@@ -21,7 +21,6 @@ use super::app::App;
 use super::ask::{AskParams, ShortParams};
 use super::forms::AreaParams;
 use super::named::as_in_json;
-use super::problem::query_problem;
 use crate::query::{AnswersOrBatch, Ask, Format, Page, RequestError};
 
 /// Longest body: 32 vectors of 2048 components as text.
@@ -99,13 +98,13 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
     let format = ask.format;
     // Before the clock starts: a budget of zero is refused, not overrun.
     let answering = app.within_limits(ask.time_budget()?, move |app, budget| {
-        let reply = app.engine.ask(ask, budget).map_err(query_problem)?;
-        let n_empty = reply.outcomes.iter().filter(|outcome| outcome.is_empty()).count();
+        let reply = app.engine.ask(ask, budget)?;
+        let n_empty = reply.answers.iter().filter(|of| of.answers.is_empty()).count();
         app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
         let Some(format) = format else {
             return Ok((serde_json::to_vec(&Page::of(&reply)).map_err(Problem::internal)?, None));
         };
-        let mut pieces = reply.pieces(format).peekable();
+        let mut pieces = Arc::new(reply).pieces(format).peekable();
         let first = pieces.next().transpose().map_err(Problem::internal)?.unwrap_or_default();
         let is_whole = pieces.peek().is_none();
         // The answers' bytes stay charged until they are sent.

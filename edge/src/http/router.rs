@@ -12,7 +12,7 @@ use slag_service::request::observed;
 use slag_service::routes::{Route, Routes};
 
 use super::app::App;
-use super::problem::{Members, SCENE, TEXTS, TIME_BUDGET};
+use super::problem::{FAILED, Members, NO_SCENE, OTHER_MODEL, TIME_BUDGET, WORDS};
 use super::{named, position, query, status, v1};
 use crate::fetch::Spoken;
 
@@ -31,9 +31,7 @@ fn routes() -> Routes<Arc<App>> {
         .details(
             "The same as /v1/query, with answers that come at once, to texts as they are. Long answers are sent in chunks; a cut-off answer ends without the last chunk.",
         )
-        .errors(&SCENE)
-        .errors(&TEXTS)
-        .errors(&[TIME_BUDGET])
+        .errors(&[FAILED, NO_SCENE, OTHER_MODEL, WORDS, TIME_BUDGET])
         .get(
             "/status",
             "scene, generation, encoder, shards, and whether the scene is past its expiry",
@@ -56,7 +54,7 @@ fn routes() -> Routes<Arc<App>> {
             status::ready,
         )
         .errors(&[
-            TEXTS[0],
+            OTHER_MODEL,
             (500, "The text model has stopped."),
             (503, "No scene is loaded, or the follower has failed; Retry-After has the pause before the next attempt."),
         ])

@@ -10,7 +10,7 @@ use slag_service::metrics::Exposition;
 use slag_service::problem::Problem;
 
 use super::app::App;
-use super::problem::{follower_failed, query_problem};
+use super::problem::follower_failed;
 use crate::fetch::accepted;
 use crate::fetch::follow::FollowStatus;
 use crate::query::Status;
@@ -43,8 +43,8 @@ pub struct ServiceStatus {
 pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem> {
     app.blocking(|app| {
         app.reload_if_stale();
-        let on_board = app.engine.on_board().map_err(query_problem)?;
-        on_board.check().map_err(query_problem)?;
+        let on_board = app.engine.on_board()?;
+        on_board.check()?;
         if !on_board.text_is_alive() {
             return Err(Problem::internal("the text model has stopped"));
         }
@@ -67,22 +67,16 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<ServiceStatus>, 
         let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
         // An expired scene still answers: an old map is better than none, if the client can tell.
         let is_expired = expires_unix_secs.is_some_and(|expires| expires <= crate::now_unix_secs());
-        let pinned_scene = accepted.and_then(|accepted| accepted.scene);
-        let following = app.following.as_ref().map(|following| following.status());
-        let scene = on_board.as_ref().ok().map(|on_board| Status::of(&on_board.snapshot));
-        let is_ready = error.is_none() && on_board.as_ref().is_ok_and(|on_board| on_board.text_is_alive());
-        let version = env!("CARGO_PKG_VERSION");
-        let text_model = app.engine.encoder().clone();
         Ok(Json(ServiceStatus {
-            version,
-            is_ready,
+            version: env!("CARGO_PKG_VERSION"),
+            is_ready: error.is_none() && on_board.as_ref().is_ok_and(|on_board| on_board.text_is_alive()),
             error,
-            text_model,
-            scene,
-            pinned_scene,
+            text_model: app.engine.encoder(),
+            scene: on_board.as_ref().ok().map(|on_board| Status::of(&on_board.snapshot)),
+            pinned_scene: accepted.and_then(|accepted| accepted.scene),
             expires_unix_secs,
             is_expired,
-            following,
+            following: app.following.as_ref().map(|following| following.status()),
         }))
     })
     .await

@@ -5,21 +5,19 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, ClusterAnswer, Clustering, Found, Searched, Whole};
+use super::answers::{Answers, ClusterAnswer, Clustering, Found, Relations, Searched, Whole};
 use super::cluster::{Cluster, Clusters, Grouping, cluster};
 use super::coverage::coverage;
+use super::engine::QueryError;
 use super::objects::{self, FoundObject, ScoredObjects};
 use super::oriented::Extent;
 use super::rank::{Order, Ranked};
 use super::reason::{self, BestObject};
-use super::relations::ClustersOfThing;
-use super::reply::RelatedAnswers;
-use super::request::{AnswerKind, QueryRequest};
+use super::relations::{self, CandidateOf, ClustersOfThing, Phrase, Things, Viewer};
+use super::request::{AnswerKind, QueryRequest, RequestError};
 use super::scale::{Scale, ThresholdSource};
 use super::scene::{Scene, alignment, default_voxel, unit};
-use crate::score::{
-    Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Scratch, Search, score_objects,
-};
+use crate::score::{Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Search, score_objects};
 use slag_common::manifest::Manifest;
 
 /// Names of the questions, and their vectors, each with its negatives.
@@ -28,44 +26,37 @@ type Questions<'a> = (&'a [&'a str], &'a [Question]);
 /// Answers a checked request about a scene: one answer for each question, in their order. Without a kind, a question
 /// that no object answers is answered by clusters.
 ///
-/// The result depends neither on the number of threads nor on the other questions. `scratch`: buffers to reuse, and
-/// the budget.
+/// The result depends neither on the number of threads nor on the other questions.
 /// # Errors
 /// [`ScoreError`]; one is a request that needs more than its budget.
 pub fn answer(
-    scratch: &mut Scratch,
     scene: &Scene<'_>,
     questions: Questions<'_>,
     request: &QueryRequest,
+    budget: &Budget,
 ) -> Result<Vec<Answers>, ScoreError> {
-    Answering { scene, request, budget: scratch.budget().clone() }.answers(scratch, questions)
+    let mut answers = Answering { scene, request, budget }.found(questions)?;
+    for Answers { reason, coverage, .. } in &mut answers {
+        if let Some(reason) = reason {
+            reason::complete(reason, &scene.shards, &request.region, coverage);
+        }
+    }
+    Ok(answers)
 }
 
 /// A request, its scene and its budget.
 pub(super) struct Answering<'a> {
     pub(super) scene: &'a Scene<'a>,
     pub(super) request: &'a QueryRequest,
-    pub(super) budget: Budget,
+    pub(super) budget: &'a Budget,
 }
 
 impl Answering<'_> {
-    fn answers(&self, scratch: &mut Scratch, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
-        let mut answers = self.found(scratch, asked)?;
-        for Answers { reason, coverage, .. } in &mut answers {
-            if let Some(reason) = reason {
-                reason::complete(reason, self.scene.shards, &self.request.region, coverage);
-            }
-        }
-        Ok(answers)
-    }
-
-    fn found(&self, scratch: &mut Scratch, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
+    fn found(&self, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
         match self.request.kind {
             Some(AnswerKind::Objects) => return self.by_objects(asked),
-            Some(kind) => return self.by_gaussians(scratch, asked, kind),
-            None if self.scene.index.is_empty() => {
-                return self.by_gaussians(scratch, asked, AnswerKind::Clusters);
-            }
+            Some(kind) => return self.by_gaussians(asked, kind),
+            None if self.scene.index.is_empty() => return self.by_gaussians(asked, AnswerKind::Clusters),
             None => {}
         }
         let mut answers = self.by_objects(asked)?;
@@ -77,7 +68,7 @@ impl Answering<'_> {
         // Ground is no object; nor is a thing that few photos outline.
         let (labels, questions): (Vec<&str>, Vec<Question>) =
             open.iter().map(|at| (asked.0[*at], asked.1[*at].clone())).unzip();
-        let clusters = self.by_gaussians(scratch, (&labels, &questions), AnswerKind::Clusters)?;
+        let clusters = self.by_gaussians((&labels, &questions), AnswerKind::Clusters)?;
         for (at, clusters) in open.into_iter().zip(clusters) {
             match (&mut answers[at].reason, &clusters.reason) {
                 // Neither answers: report both reasons.
@@ -96,19 +87,14 @@ impl Answering<'_> {
     }
 
     fn by_objects(&self, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
-        let Scene { shards, objects, index, .. } = *self.scene;
+        let Scene { shards, objects, index, .. } = self.scene;
         let scored = score_objects(shards, objects, index, asked.1)?;
         self.each(asked, &scored, |text, question, scored| self.objects(text, question, scored))
     }
 
-    fn by_gaussians(
-        &self,
-        scratch: &mut Scratch,
-        asked: Questions<'_>,
-        kind: AnswerKind,
-    ) -> Result<Vec<Answers>, ScoreError> {
-        let (region, precision) = (self.request.region.clone(), self.request.precision);
-        let searches = Search::batch(scratch, self.scene.shards, asked.1, region, precision)?;
+    fn by_gaussians(&self, asked: Questions<'_>, kind: AnswerKind) -> Result<Vec<Answers>, ScoreError> {
+        let (region, precision) = (&self.request.region, self.request.precision);
+        let searches = Search::batch(&self.scene.shards, asked.1, region, precision, self.budget)?;
         self.each(asked, &searches, |text, question, search| self.gaussians((text, kind), question, search))
     }
 
@@ -133,7 +119,7 @@ impl Answering<'_> {
     fn objects(&self, text: &str, question: &Question, scored: &ObjectScores) -> Answers {
         let Self { scene, request, budget } = self;
         let (manifest, scale, region) = (scene.manifest, Scale::of(question), &request.region);
-        let calibration = objects::calibration(scene.objects);
+        let calibration = objects::calibration(&scene.objects);
         let threshold = scale.threshold(request, manifest, calibration);
         let of_score = scale.to_score(threshold.0);
         let objects = ScoredObjects { scene, scores: &scored.scores, region, min_count: request.min_count };
@@ -252,18 +238,14 @@ impl Answering<'_> {
         let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
         let (min_count, alignment, with_members) = (request.min_count, alignment(manifest), request.members);
         let grouping = Grouping { voxel, min_count, threshold, alignment, with_members };
-        (cluster(scene.shards, &matches.runs, &grouping, &self.budget), matches.n_gaussians)
+        (cluster(&scene.shards, &matches.runs, &grouping, self.budget), matches.n_gaussians)
     }
 
     /// Returns the clusters of things anywhere on board, for the parts of a phrase that no object answers.
-    pub(super) fn clusters_of_things(
-        &self,
-        scratch: &mut Scratch,
-        questions: &[Question],
-    ) -> Result<Vec<ClustersOfThing>, ScoreError> {
-        let manifest = self.scene.manifest;
-        let precision = self.request.precision;
-        let searches = Search::batch(scratch, self.scene.shards, questions, Region::default(), precision)?;
+    fn clusters_of_things(&self, questions: &[Question]) -> Result<Vec<ClustersOfThing>, ScoreError> {
+        let Scene { manifest, shards, .. } = self.scene;
+        let (everywhere, precision) = (Region::default(), self.request.precision);
+        let searches = Search::batch(shards, questions, &everywhere, precision, self.budget)?;
         let of_thing = |(question, search): (&Question, &Search<'_>)| {
             let (scale, calibration) = (Scale::of(question), manifest.encoder.calibration);
             let (threshold, _) = scale.threshold(self.request, manifest, calibration);
@@ -274,24 +256,70 @@ impl Answering<'_> {
         questions.iter().zip(&searches).map(of_thing).collect()
     }
 
-    /// Returns the answers to a phrase as those to a text, without degrees and witnesses.
-    pub(super) fn of_related(&self, text: &str, related: RelatedAnswers, question: &Question) -> Answers {
-        let (scene, scale) = (self.scene, Scale::of(question));
-        let threshold = scale.threshold(self.request, scene.manifest, objects::calibration(scene.objects));
-        let answers: Vec<ClusterAnswer> = related.answers.into_iter().map(|(answer, ..)| answer).collect();
-        let empty = self.empty((text, AnswerKind::Objects), scale, threshold);
-        let (n_searched, n_matching) = (
-            n_with_evidence(scene, &self.request.region),
-            answers.iter().map(|answer| answer.n_gaussians).sum(),
-        );
-        let searched = Searched { n_searched, n_matching, ..empty.searched };
-        Answers {
-            searched,
-            coverage: related.coverage,
-            reason: related.miss,
-            answers: Found::Clusters(answers),
-            ..empty
+    /// Answers a phrase. `questions`: its things, in their order.
+    pub(super) fn related(
+        &self,
+        label: &str,
+        phrase: &Phrase,
+        questions: &[Question],
+    ) -> Result<Answers, QueryError> {
+        let Self { scene, request, .. } = *self;
+        let has_up = scene.manifest.metric || scene.manifest.geo_reference.is_some();
+        if !has_up && needs_up(phrase) {
+            let expected = "near, in or between, as this scene's up is not known; where its world has z up and \
+                            metres, encode it with --metric";
+            return Err(RequestError::new("phrases", &phrase.thing, expected).into());
         }
+        let scored = score_objects(&scene.shards, &scene.objects, scene.index, questions)?;
+        let mut things = Things::find(scene, &phrase.things(), questions, &scored, request);
+        let open = if request.kind == Some(AnswerKind::Objects) { Vec::new() } else { things.open() };
+        if !open.is_empty() {
+            let of_open: Vec<Question> = open.iter().map(|at| questions[*at].clone()).collect();
+            for (at, found) in open.into_iter().zip(self.clusters_of_things(&of_open)?) {
+                things.set_clusters(at, found, scene, &request.region);
+            }
+        }
+        let parts = things.found();
+        let viewer = request
+            .near
+            .map(|position_in_world| Viewer { position_in_world, heading_rad: request.heading_rad });
+        let related = relations::relate(&things, phrase, viewer.as_ref(), relations::metre(scene.manifest));
+        let scale = Scale::of(&questions[0]);
+        let threshold = scale.threshold(request, scene.manifest, objects::calibration(&scene.objects));
+        let mut answers = self.empty((label, AnswerKind::Objects), scale, threshold);
+        let mut to = Vec::new();
+        match related {
+            Ok(found) => {
+                let of = things.of(&phrase.thing);
+                let described = found.into_iter().take(request.n_ranked()).zip(1..).map(|(related, rank)| {
+                    let candidate = &of[related.candidate];
+                    let relevance = related.score as f32;
+                    let distance = request.near.map(|near| near.distance(candidate.position_in_world()));
+                    to.push((related.degree, related.to));
+                    match candidate.of.clone() {
+                        CandidateOf::Object(found) => {
+                            let ranked = Ranked { found, rank, relevance, distance };
+                            object_answer(scene, ranked, candidate.score, &Region::default(), request.members)
+                        }
+                        CandidateOf::Cluster(found) => {
+                            cluster_answer(Ranked { found, rank, relevance, distance }, scene.manifest)
+                        }
+                    }
+                });
+                let described: Vec<ClusterAnswer> = described.collect();
+                answers.searched.n_matching = described.iter().map(|answer| answer.n_gaussians).sum();
+                answers.answers = Found::Clusters(described);
+            }
+            Err(mut miss) => {
+                let part = parts.iter().find(|part| Some(&*part.thing) == miss.thing.as_deref());
+                miss.best_score = part.and_then(|part| part.best_score);
+                reason::complete(&mut miss, &scene.shards, &request.region, &answers.coverage);
+                answers.reason = Some(miss);
+            }
+        }
+        answers.searched.n_searched = n_with_evidence(scene, &request.region);
+        answers.related = Some(Relations { parts, to });
+        Ok(answers)
     }
 
     fn empty(&self, asked: (&str, AnswerKind), scale: Scale, threshold: (f32, ThresholdSource)) -> Answers {
@@ -315,12 +343,17 @@ impl Answering<'_> {
             generation: manifest.generation,
             unit: unit(manifest),
             searched,
-            coverage: coverage(manifest, self.scene.bad_cells, self.scene.fetched, &request.region),
+            coverage: coverage(self.scene, &request.region),
             asked_as: BTreeMap::new(),
             reason: None,
             answers: Found::Clusters(Vec::new()),
+            related: None,
         }
     }
+}
+
+fn needs_up(phrase: &Phrase) -> bool {
+    phrase.relation.as_ref().is_some_and(|place| place.is.needs_up()) || phrase.inner().any(needs_up)
 }
 
 /// Returns the number of Gaussians with evidence in the shards that a region touches.
@@ -329,7 +362,7 @@ fn n_with_evidence(scene: &Scene<'_>, region: &Region) -> u64 {
     shards.map(|shard| shard.n_with_evidence() as u64).sum()
 }
 
-pub(super) fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
+fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
     let Ranked { found: cluster, rank, relevance, distance } = ranked;
     let Extent { position_in_world, box_in_world } = cluster.extent;
     ClusterAnswer {
@@ -353,7 +386,8 @@ pub(super) fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> Cl
     }
 }
 
-pub(super) fn object_answer(
+/// Describes an object as the cluster of its Gaussians in a region.
+fn object_answer(
     scene: &Scene<'_>,
     ranked: Ranked<FoundObject<'_>>,
     score: f32,
@@ -362,29 +396,24 @@ pub(super) fn object_answer(
 ) -> ClusterAnswer {
     let Ranked { found, rank, relevance, distance } = ranked;
     let FoundObject { object, record, n_gaussians, cut, .. } = found;
-    let manifest = scene.manifest;
-    let Extent { position_in_world, box_in_world } = found.extent();
+    let cluster = Cluster {
+        first: (0, 0),
+        n_gaussians,
+        score,
+        best_score: score,
+        extent: found.extent(),
+        oriented_box: objects::oriented_box(scene, &found, region, alignment(scene.manifest)),
+        members: if with_members { objects::members(scene, object, region, score) } else { Vec::new() },
+    };
     let whole = cut.map(|_| {
         let (position_in_world, bounds) = (record.position(), record.bounds());
         Whole { position_in_world, box_min_in_world: bounds.min, box_max_in_world: bounds.max }
     });
     ClusterAnswer {
-        rank,
         id: found.public_id(),
-        position_in_world,
-        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
-        box_min_in_world: box_in_world.min,
-        box_max_in_world: box_in_world.max,
-        size: box_in_world.size(),
-        oriented_box: objects::oriented_box(scene, &found, region, alignment(manifest)),
-        score,
-        best_score: score,
-        n_gaussians,
         n_gaussians_in_scene: Some(u64::from(record.n_gaussians)),
         whole,
         evidence: Some(objects::evidence(scene, object)),
-        relevance,
-        distance,
-        members: if with_members { objects::members(scene, object, region, score) } else { Vec::new() },
+        ..cluster_answer(Ranked { found: cluster, rank, relevance, distance }, scene.manifest)
     }
 }

@@ -12,11 +12,13 @@ use slag_api::objects::{Evidence, OrientedBox};
 use slag_common::frames::Geographic;
 use slag_common::shard::ShardView;
 
+use super::reason::Reason;
+use super::relations::{self, Witness};
 use super::request::AnswerKind;
 use super::scale::{ScoreKind, ThresholdSource};
 use crate::score::{Hit, Run};
 
-/// Answers to one question. `answers` is the last field, so that long lists can be sent piece by piece.
+/// Answers to one question. `answers` is the last field written, so that long lists can be sent piece by piece.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Answers {
     /// The question.
@@ -45,6 +47,17 @@ pub struct Answers {
     #[serde(serialize_with = "empty_list")]
     #[schemars(with = "Vec<AnyAnswer>")]
     pub answers: Found,
+    /// Of a phrase.
+    #[serde(skip)]
+    pub related: Option<Relations>,
+}
+
+/// The parts of a phrase, and how its answers are related.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Relations {
+    pub parts: Vec<relations::Found>,
+    /// By answer: degree of the relation, and what it holds with.
+    pub to: Vec<(f64, Vec<Witness>)>,
 }
 
 /// How a text or vector was searched for.
@@ -250,67 +263,6 @@ impl GaussianAnswer {
             position_in_world,
             score: hit.score,
             distance: near.map(|near| near.distance(position_in_world)),
-        }
-    }
-}
-
-/// Kind of reason for an empty answer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum ReasonKind {
-    /// No Gaussian or object reaches the threshold.
-    BelowThreshold,
-    /// Gaussians or objects match, but no cluster and no object has enough Gaussians.
-    ClustersTooSmall,
-    /// The region asked for holds nothing that could match.
-    NothingThere,
-    /// Views saw less than half of the region asked for.
-    NotLookedThere,
-    /// Of a phrase: nothing on board is such a thing.
-    NoSuchThing,
-    /// Of a phrase: such things are on board, but none is so placed.
-    NoSuchPair,
-    /// Of a phrase: there are fewer of them than counted.
-    TooFew,
-    /// Of a phrase: such things are on board, but none in the region asked for.
-    NotInRegion,
-}
-
-/// Reason for an empty answer, with the nearest miss.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
-pub struct Reason {
-    /// Kind.
-    pub kind: ReasonKind,
-    /// The reason in words.
-    pub detail: String,
-    /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub seen_share: Option<f64>,
-    /// Best score found.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub best_score: Option<f32>,
-    /// Position of the best score.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schemars(with = "Option<[f64; 3]>")]
-    pub best_position_in_world: Option<DVec3>,
-    /// Of a phrase: the thing that is missing, or not so placed.
-    #[serde(skip)]
-    pub thing: Option<Box<str>>,
-    /// Of a phrase: greatest degree of the relation among all pairs.
-    #[serde(skip)]
-    pub best_degree: Option<f64>,
-}
-
-impl Reason {
-    pub fn new(kind: ReasonKind, detail: String) -> Self {
-        Self {
-            kind,
-            detail,
-            seen_share: None,
-            best_score: None,
-            best_position_in_world: None,
-            thing: None,
-            best_degree: None,
         }
     }
 }

@@ -22,12 +22,13 @@ use arrow_schema::{ArrowError, DataType, Field, Schema};
 
 use super::answers::Found;
 use super::reply::Reply;
+use crate::score::Hit;
 
 /// Rows per batch: half a megabyte.
 const BATCH_ROWS: usize = 16 << 10;
 
 pub struct Pieces {
-    reply: Reply,
+    reply: Arc<Reply>,
     schema: Arc<Schema>,
     writer: Option<StreamWriter<Vec<u8>>>,
     question: usize,
@@ -36,7 +37,7 @@ pub struct Pieces {
 }
 
 impl Pieces {
-    pub fn new(reply: Reply) -> Self {
+    pub fn new(reply: Arc<Reply>) -> Self {
         let schema = Arc::new(schema(&reply));
         Self { reply, schema, writer: None, question: 0, item: 0, is_closed: false }
     }
@@ -48,7 +49,7 @@ impl Pieces {
             self.writer = Some(writer);
             return Ok(piece);
         };
-        let gaussians = |question: usize| match self.reply.answers().nth(question).map(|a| &a.answers) {
+        let gaussians = |question: usize| match self.reply.answers.get(question).map(|a| &a.answers) {
             Some(Found::Gaussians(hits)) => Some(&hits[..]),
             Some(Found::Clusters(_)) => Some(&[][..]),
             None => None,
@@ -59,7 +60,7 @@ impl Pieces {
         match gaussians(self.question) {
             Some(hits) => {
                 let end = hits.len().min(self.item + BATCH_ROWS);
-                writer.write(&batch(&self.reply, &self.schema, self.question, self.item..end)?)?;
+                writer.write(&batch(&self.reply, &self.schema, self.question, &hits[self.item..end])?)?;
                 self.item = end;
             }
             None => {
@@ -87,7 +88,7 @@ impl Iterator for Pieces {
 fn schema(reply: &Reply) -> Schema {
     let column = |name: &str, kind: DataType| Field::new(name, kind, false);
     let mut columns = Vec::new();
-    if reply.outcomes.len() != 1 {
+    if reply.answers.len() != 1 {
         columns.push(column("question", DataType::UInt32));
     }
     columns.extend(["x", "y", "z"].map(|name| column(name, DataType::Float64)));
@@ -101,9 +102,9 @@ fn schema(reply: &Reply) -> Schema {
         ("scene".to_owned(), manifest.scene.clone()),
         ("generation".to_owned(), manifest.generation.to_string()),
         ("frame".to_owned(), "world".to_owned()),
-        ("questions".to_owned(), json(serde_json::to_string(&reply.answers().collect::<Vec<_>>()))),
+        ("questions".to_owned(), json(serde_json::to_string(&reply.answers))),
     ]);
-    if let Some(first) = reply.answers().next() {
+    if let Some(first) = reply.answers.first() {
         let kind = serde_json::to_value(first.searched.score_kind).ok();
         let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default();
         metadata.insert("unit".into(), first.unit.into());
@@ -121,20 +122,16 @@ fn batch(
     reply: &Reply,
     schema: &Arc<Schema>,
     question: usize,
-    items: std::ops::Range<usize>,
+    hits: &[Hit],
 ) -> Result<RecordBatch, ArrowError> {
-    let hits = match reply.answers().nth(question).map(|answers| &answers.answers) {
-        Some(Found::Gaussians(hits)) => &hits[items],
-        _ => &[],
-    };
     let views: Vec<_> = reply.snapshot.shards.iter().map(|shard| shard.view()).collect();
-    let shard = |hit: &crate::score::Hit| &views[hit.shard as usize];
+    let shard = |hit: &Hit| &views[hit.shard as usize];
     let positions: Vec<_> = hits.iter().map(|hit| shard(hit).position_in_world(hit.index as usize)).collect();
     let along = |axis: usize| {
         Arc::new(Float64Array::from_iter_values(positions.iter().map(|position| position[axis])))
     };
     let mut columns: Vec<ArrayRef> = Vec::new();
-    if reply.outcomes.len() != 1 {
+    if reply.answers.len() != 1 {
         columns.push(Arc::new(UInt32Array::from_value(question as u32, hits.len())));
     }
     columns.extend((0..3).map(|axis| along(axis) as ArrayRef));

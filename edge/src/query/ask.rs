@@ -5,6 +5,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::de::{DeserializeOwned, IntoDeserializer};
 use serde::{Deserialize, Deserializer};
+use slag_common::manifest::Manifest;
 
 use super::area::{Area, Point};
 use super::format::Format;
@@ -14,7 +15,6 @@ use super::request::{
     QueryRequest, RequestError, Words,
 };
 use crate::score::{MAX_COORDINATE, Precision};
-use crate::store::Snapshot;
 
 /// What is asked for: at least one text, vector or phrase, 32 together at most. Everything else is optional.
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
@@ -88,8 +88,8 @@ impl Ask {
         }
     }
 
-    /// Interprets the questions for a generation. Texts with relations stay plain texts where it has no objects.
-    pub(super) fn understand(self, snapshot: &Snapshot) -> Result<QueryRequest, RequestError> {
+    /// Returns the questions in a scene's world frame.
+    pub(super) fn in_world(self, manifest: &Manifest) -> Result<QueryRequest, RequestError> {
         let n = self.texts.len() + self.vectors.len() + self.phrases.len();
         if !(1..=MAX_TEXTS).contains(&n) {
             let expected = format!("1 to {MAX_TEXTS} texts, vectors and phrases together");
@@ -105,8 +105,7 @@ impl Ask {
         let texts = self.texts.into_iter().map(Asked::Text);
         let vectors = self.vectors.into_iter().enumerate().map(|(at, vector)| Asked::Vector { at, vector });
         let phrases = self.phrases.into_iter().map(|phrase| Asked::Phrase { text: None, phrase });
-        let manifest = &snapshot.manifest;
-        let mut request = QueryRequest {
+        Ok(QueryRequest {
             asked: texts.chain(vectors).chain(phrases).collect(),
             negatives: self.negatives,
             limit: self.limit,
@@ -121,11 +120,7 @@ impl Ask {
             min_count: self.min_count.unwrap_or(DEFAULT_MIN_COUNT),
             precision: self.precision,
             members: self.format == Some(Format::Ply),
-        };
-        if self.relations.unwrap_or(true) {
-            request.understand(snapshot)?;
-        }
-        request.check()?;
-        Ok(request)
+            relations: self.relations.unwrap_or(true),
+        })
     }
 }

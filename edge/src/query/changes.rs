@@ -11,7 +11,7 @@ use slag_common::objects::{self, Moved, Thing, public_id};
 use super::engine::{Engine, QueryError};
 use super::request::RequestError;
 use super::scene::unit;
-use crate::score::{Budget, ScoreError};
+use crate::score::Budget;
 use crate::store::history::{self, Record};
 use crate::store::{EdgeCache, Snapshot};
 
@@ -79,8 +79,7 @@ impl Engine {
         let of_thing =
             size_of::<Thing>() + size_of::<ChangedThing>() + size_of::<f64>() * manifest.encoder.dim as usize;
         budget.take(2 * of_thing * snapshot.objects.len());
-        let spent = |error| QueryError::from(ScoreError::from(error));
-        budget.check().map_err(spent)?;
+        budget.check().map_err(QueryError::from)?;
         let generations = known(self.cache(), manifest);
         let to = generation(self.cache(), snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
         let from = match request.from {
@@ -101,7 +100,7 @@ impl Engine {
         {
             return Err(ChangesError::Encoders { from: from.generation, to: to.generation });
         }
-        budget.check().map_err(spent)?;
+        budget.check().map_err(QueryError::from)?;
         Ok(reply(from, to, manifest, generations, request, &words))
     }
 }
@@ -139,7 +138,7 @@ fn generation(
 
 fn reply(
     from: Option<Record>,
-    to: Record,
+    mut to: Record,
     manifest: &Manifest,
     generations: Vec<u64>,
     request: &ChangesRequest,
@@ -149,47 +148,44 @@ fn reply(
         generation: of.generation,
         created_unix_secs: of.created_unix_secs,
     };
-    let mut reply = ChangesReply {
-        scene: manifest.scene.clone(),
-        frame: FRAME.into(),
-        unit: unit(manifest).into(),
-        from: from.as_ref().map(compared),
-        to: compared(&to),
-        generations,
-        n_same: 0,
-        n_stayed: 0,
-        n_not_compared: 0,
-        appeared: Vec::new(),
-        went: Vec::new(),
-        moved: Vec::new(),
-        none: None,
-    };
-    let Some(mut from) = from else {
-        let detail = format!("the robot has had no generation with objects before {}", to.generation);
-        reply.none = Some(NotCompared { kind: NO_EARLIER.into(), detail });
-        return reply;
-    };
-    let mut to = to;
-    let (old, new) = (std::mem::take(&mut from.things), std::mem::take(&mut to.things));
-    let new_tells = |thing: &Thing| to.tells_of(thing, from.places());
-    let old_tells = |thing: &Thing| from.tells_of(thing, to.places());
-    let found = objects::changes(old, new, new_tells, old_tells);
+    let ends = (from.as_ref().map(compared), compared(&to));
+    let found = from.map(|mut from| {
+        let (old, new) = (std::mem::take(&mut from.things), std::mem::take(&mut to.things));
+        let new_tells = |thing: &Thing| to.tells_of(thing, from.places());
+        let old_tells = |thing: &Thing| from.tells_of(thing, to.places());
+        objects::changes(old, new, new_tells, old_tells)
+    });
+    let none = found.is_none().then(|| NotCompared {
+        kind: NO_EARLIER.into(),
+        detail: format!("the robot has had no generation with objects before {}", to.generation),
+    });
+    let found = found.unwrap_or_default();
     let is_asked = |thing: &Thing| {
         request.ball.is_none_or(|(centre, radius)| thing.position_in_world.distance(centre) <= radius)
     };
     let describe = |thing: &Thing| words.describe(thing, manifest);
     let some = |things: &[Thing]| things.iter().filter(|of| is_asked(of)).map(describe).collect();
-    (reply.n_same, reply.n_stayed, reply.n_not_compared) =
-        (found.n_same, found.n_stayed, found.n_not_compared);
-    (reply.appeared, reply.went) = (some(&found.appeared), some(&found.went));
     let moved = found.moved.iter().filter(|moved| is_asked(&moved.from) || is_asked(&moved.to));
     let describe_move = |moved: &Moved| MovedThing {
         from: describe(&moved.from),
         to: describe(&moved.to),
         distance: moved.distance,
     };
-    reply.moved = moved.map(describe_move).collect();
-    reply
+    ChangesReply {
+        scene: manifest.scene.clone(),
+        frame: FRAME.into(),
+        unit: unit(manifest).into(),
+        from: ends.0,
+        to: ends.1,
+        generations,
+        n_same: found.n_same,
+        n_stayed: found.n_stayed,
+        n_not_compared: found.n_not_compared,
+        appeared: some(&found.appeared),
+        went: some(&found.went),
+        moved: moved.map(describe_move).collect(),
+        none,
+    }
 }
 
 /// The request's texts and their unit vectors.

@@ -1,27 +1,22 @@
 //! Query engine: a cache and a text model, shared by the HTTP service and the command line.
 
-use std::path::PathBuf;
+use std::io;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use slag_api::objects::OrientedBox;
 use slag_common::Hash32;
 use slag_common::manifest::{Manifest, TextModelRecord};
-use slag_common::objects::Objects;
-use slag_common::shard::ShardView;
 use slag_models::{InferenceError, ModelDir, SessionOptions};
 
 use super::names::{Names, Words};
 use super::relations;
 use super::request::{QueryRequest, RequestError, check_text};
-use super::scene::Scene;
-use crate::score::{Budget, OverBudget, ScoreError, Scratch};
+use crate::score::{OverBudget, ScoreError};
 use crate::store::files::Stat;
 use crate::store::{EdgeCache, Snapshot, StoreError, damaged};
 use crate::text::{EncoderInfo, TextError, TextOpenError, TextService};
 
-/// Buffers of answers that used more are dropped.
-const KEPT_BYTES: u64 = 32 << 20;
 /// Retry interval of a failed load while `current` is unchanged: disk full, too many open files.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
@@ -41,6 +36,12 @@ pub enum QueryError {
     EncoderMismatch { models_name: String, models_id: Hash32, scene_name: String, scene_id: Hash32 },
     #[error(transparent)]
     Score(#[from] ScoreError),
+}
+
+impl From<OverBudget> for QueryError {
+    fn from(error: OverBudget) -> Self {
+        Self::Score(error.into())
+    }
 }
 
 impl QueryError {
@@ -65,9 +66,9 @@ impl QueryError {
 }
 
 struct Loaded {
+    /// That of the generation on board, or of one to come.
     text: Arc<TextService>,
-    snapshot: Option<Arc<Snapshot>>,
-    listed: Arc<Listed>,
+    on_board: Option<Arc<OnBoard>>,
     /// State of `current` at the last attempt to load it.
     tried: Option<Stat>,
     failed_at: Option<Instant>,
@@ -77,17 +78,18 @@ struct Loaded {
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
     pub(super) text: Arc<TextService>,
-    pub(super) listed: Arc<Listed>,
-}
-
-/// The names of a generation's things and their oriented boxes, in index order.
-#[derive(Default)]
-pub(super) struct Listed {
+    /// Names of its things, in index order.
     pub(super) names: OnceLock<Names>,
+    /// Their oriented boxes.
     pub(super) boxes: OnceLock<Vec<OnceLock<OrientedBox>>>,
 }
 
 impl OnBoard {
+    fn new(snapshot: Snapshot, text: &Arc<TextService>) -> Arc<Self> {
+        let (snapshot, text) = (Arc::new(snapshot), Arc::clone(text));
+        Arc::new(Self { snapshot, text, names: OnceLock::new(), boxes: OnceLock::new() })
+    }
+
     /// Checks that text model and scene use the same embedding space.
     pub fn check(&self) -> Result<(), QueryError> {
         let (models, scene) = (self.text.info(), &self.snapshot.manifest.encoder);
@@ -118,14 +120,6 @@ impl OnBoard {
     }
 }
 
-/// Opens the text model that a scene carries; failure is logged.
-fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
-    open_text_model(cache, manifest, options).unwrap_or_else(|error| {
-        tracing::warn!("the scene's text model does not open: {}", crate::error_line(&error));
-        None
-    })
-}
-
 /// Answers questions from the newest generation of a cache.
 pub struct Engine {
     cache: EdgeCache,
@@ -133,21 +127,12 @@ pub struct Engine {
     carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
     pub(super) words: Mutex<Option<Arc<Words>>>,
-    /// Buffers of finished answers, one per concurrent answer.
-    idle: Mutex<Vec<Scratch>>,
 }
 
 impl Engine {
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
-        let (text, listed) = (Arc::new(text), Arc::default());
-        let loaded = Loaded { text, snapshot: None, listed, tried: None, failed_at: None };
-        Self {
-            cache,
-            carried: None,
-            loaded: RwLock::new(loaded),
-            words: Mutex::default(),
-            idle: Mutex::default(),
-        }
+        let loaded = Loaded { text: Arc::new(text), on_board: None, tried: None, failed_at: None };
+        Self { cache, carried: None, loaded: RwLock::new(loaded), words: Mutex::default() }
     }
 
     /// Makes an engine that uses each scene's own text model if it has one, else that of `otherwise`.
@@ -204,8 +189,8 @@ impl Engine {
         match opened {
             Ok(snapshot) => {
                 let (tried, failed_at) = (snapshot.current_stat, snapshot.may_recover.then(Instant::now));
-                let snapshot = Some(Arc::new(snapshot));
-                let fresh = Loaded { text, snapshot, listed: Arc::default(), tried, failed_at };
+                let on_board = Some(OnBoard::new(snapshot, &text));
+                let fresh = Loaded { text, on_board, tried, failed_at };
                 let before = std::mem::replace(&mut *loaded, fresh);
                 // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
@@ -222,85 +207,48 @@ impl Engine {
     }
 
     pub fn snapshot(&self) -> Result<Arc<Snapshot>, QueryError> {
-        let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
-        loaded.snapshot.clone().ok_or(QueryError::NoScene)
+        self.on_board().map(|on_board| Arc::clone(&on_board.snapshot))
     }
 
     /// Returns the loaded generation and the text model that came into use with it.
-    pub fn on_board(&self) -> Result<OnBoard, QueryError> {
+    pub fn on_board(&self) -> Result<Arc<OnBoard>, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
-        let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
-        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), listed: Arc::clone(&loaded.listed) })
-    }
-
-    /// Runs work on a generation, reusing buffers.
-    pub(super) fn on_scene<T>(
-        &self,
-        snapshot: &Snapshot,
-        budget: &Budget,
-        work: impl FnOnce(&mut Scratch, &Scene<'_>) -> T,
-    ) -> T {
-        let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
-        let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
-        let objects: Vec<Option<Objects<'_>>> =
-            snapshot.shards.iter().map(|shard| shard.additions().objects).collect();
-        let (index, manifest) = (&snapshot.objects, &snapshot.manifest);
-        let bad_cells = &snapshot.bad_cells;
-        let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched, bad_cells };
-        let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut scratch = idle().pop().unwrap_or_default();
-        scratch.set_budget(budget.clone());
-        let done = work(&mut scratch, &scene);
-        scratch.set_budget(Budget::default());
-        if budget.used_bytes() <= KEPT_BYTES {
-            idle().push(scratch);
-        }
-        done
+        loaded.on_board.clone().ok_or(QueryError::NoScene)
     }
 }
 
 /// Longest description read; those of public models take two thousand bytes.
 const MAX_DESCRIPTION_BYTES: u64 = 1 << 20;
 
-#[derive(Debug, thiserror::Error)]
-pub enum CarriedError {
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    #[error("{path}: {cause}; fetch again, which replaces what is damaged", path = path.display())]
-    Open { path: PathBuf, cause: Box<TextOpenError> },
-}
-
-/// Opens the text model that a scene carries; `None` if it carries none.
-fn open_text_model(
-    cache: &EdgeCache,
-    manifest: &Manifest,
-    options: &SessionOptions,
-) -> Result<Option<TextService>, CarriedError> {
-    let Some(record) = &manifest.encoder.text_model else { return Ok(None) };
+/// Opens the text model that a scene carries, if it does; failure is logged.
+fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
+    let record = manifest.encoder.text_model.as_ref()?;
     let expected = record.description.hash;
     let path = cache.shard_path(expected);
-    let mark = || mark_damaged(cache, record);
-    let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
-    let bytes = read.inspect_err(|e| {
-        if e.is_damage() {
-            mark()
+    let failed = |is_damaged: bool, error: &(dyn std::error::Error + 'static)| {
+        if is_damaged {
+            mark_damaged(cache, record);
         }
-    })?;
+        tracing::warn!("the scene's text model does not open: {}", crate::error_line(error));
+    };
+    let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
+    let bytes = read.inspect_err(|e| failed(e.is_damage(), e)).ok()?;
     let found = Hash32::of(&bytes);
     if found != expected {
-        mark();
-        return Err(StoreError::Hash { path, expected, found }.into());
+        failed(true, &StoreError::Hash { path, expected, found });
+        return None;
     }
     let folder = path.parent().unwrap_or(cache.dir());
     let opened = ModelDir::carried(&bytes, &path, folder)
         .map_err(TextOpenError::Model)
         .and_then(|models| TextService::open(&models, options));
-    opened.map(Some).map_err(|cause| {
-        if matches!(cause, TextOpenError::Model(_)) {
-            mark();
-        }
-        CarriedError::Open { path, cause: Box::new(cause) }
-    })
+    let advice = |cause: TextOpenError| {
+        let is_damaged = matches!(cause, TextOpenError::Model(_));
+        let (path, cause) = (path.display(), crate::error_line(&cause));
+        let told = format!("{path}: {cause}; fetch again, which replaces what is damaged");
+        failed(is_damaged, &io::Error::other(told));
+    };
+    opened.map_err(advice).ok()
 }
 
 /// Marks the files that differ from the record; the next fetch downloads them again.
@@ -310,46 +258,5 @@ fn mark_damaged(cache: &EdgeCache, record: &TextModelRecord) {
         if !read.is_ok_and(|bytes| Hash32::of(&bytes) == object.hash) {
             damaged::mark(cache, object.hash);
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::atomic::{AtomicBool, Ordering};
-
-    use super::*;
-    use crate::testing::{Axes, Member, TestShard, write_cache};
-
-    fn loaded(encoder: u8) -> Loaded {
-        let (dir, id) = (tempfile::tempdir().expect("a folder"), Hash32([encoder; 32]));
-        let shard = TestShard::new(vec![vec![Member { steps: [0; 3], embedding: vec![1.0, 0.0] }]]);
-        write_cache(dir.path(), &[TestShard { encoder_id: id, ..shard }.build(false)], 1);
-        let snapshot = Snapshot::open(&EdgeCache::open(dir.path())).expect("opens");
-        let info = EncoderInfo { id, ..Axes::info(2) };
-        let text = TextService::start(info, Box::new(Axes::new(2))).expect("a thread");
-        let (text, snapshot) = (Arc::new(text), Some(Arc::new(snapshot)));
-        Loaded { text, snapshot, listed: Arc::default(), tried: None, failed_at: None }
-    }
-
-    /// While generations of two encoders alternate, no question mixes one's text model with the other's scene.
-    #[test]
-    fn a_scene_is_asked_with_its_own_text_model() {
-        let (mut other, first) = (loaded(8), loaded(7));
-        let text = TextService::start(Axes::info(2), Box::new(Axes::new(2))).expect("a thread");
-        let engine = Engine::new(EdgeCache::open("unused"), text);
-        *engine.loaded.write().expect("no panic") = first;
-        let is_over = AtomicBool::new(false);
-        let mixed = std::thread::scope(|threads| {
-            threads.spawn(|| {
-                while !is_over.load(Ordering::Relaxed) {
-                    std::mem::swap(&mut *engine.loaded.write().expect("no panic"), &mut other);
-                }
-            });
-            let on_board = |_| engine.on_board().expect("a scene").check().err();
-            let mixed = (0..20_000).find_map(on_board);
-            is_over.store(true, Ordering::Relaxed);
-            mixed
-        });
-        assert!(mixed.is_none(), "{mixed:?}");
     }
 }

@@ -1,6 +1,7 @@
 //! Formats of a reply.
 
 use std::io;
+use std::sync::Arc;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -40,16 +41,11 @@ impl Format {
 }
 
 impl Reply {
-    /// Returns the Gaussians of all answers as a PLY of points, in the pieces of [`Reply::pieces`]. Clusters and
+    /// Returns the reply in pieces of at most a fraction of a megabyte, each made on demand. As a PLY, clusters and
     /// objects need [`QueryRequest::members`](super::QueryRequest::members).
-    pub fn ply(&self) -> impl Iterator<Item = io::Result<Vec<u8>>> {
-        ply::Pieces::new(self)
-    }
-
-    /// Returns the reply in pieces of at most a fraction of a megabyte, each made on demand.
-    pub fn pieces(self, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
+    pub fn pieces(self: Arc<Self>, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
         match format {
-            Format::Json => Box::new(JsonPieces::new(self)),
+            Format::Json => Box::new(JsonPieces { reply: self, question: 0, item: 0, is_closed: false }),
             Format::Ply => Box::new(ply::Pieces::new(self)),
             #[cfg(feature = "arrow")]
             Format::Arrow => Box::new(arrow::Pieces::new(self)),
@@ -62,7 +58,7 @@ const JSON_PIECE_BYTES: usize = 64 << 10;
 const ANSWER_BYTES: usize = 1 << 10;
 
 struct JsonPieces {
-    reply: Reply,
+    reply: Arc<Reply>,
     /// The next item: an index into a question's answers.
     question: usize,
     item: usize,
@@ -86,14 +82,10 @@ impl Iterator for JsonPieces {
 }
 
 impl JsonPieces {
-    fn new(reply: Reply) -> Self {
-        Self { reply, question: 0, item: 0, is_closed: false }
-    }
-
     fn fill(&mut self, piece: &mut Vec<u8>) -> io::Result<()> {
-        let is_batch = self.reply.outcomes.len() != 1;
+        let is_batch = self.reply.answers.len() != 1;
         while !self.is_closed && piece.len() < JSON_PIECE_BYTES {
-            let Some(answers) = self.reply.answers().nth(self.question) else {
+            let Some(answers) = self.reply.answers.get(self.question) else {
                 self.is_closed = true;
                 if is_batch {
                     piece.extend(b"]}");

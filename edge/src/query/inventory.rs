@@ -21,8 +21,7 @@ use super::objects::{self, FoundObject};
 use super::oriented::Extent;
 use super::request::RequestError;
 use super::scene::{Scene, alignment, default_voxel, unit};
-use crate::score::{Budget, Region, Run, ScoreError};
-use crate::store::Snapshot;
+use crate::score::{Budget, Region, Run};
 
 // The API's description states the number of names.
 const _: () = assert!(MAX_NAMES == slag_models::names::MAX_NAMES);
@@ -61,80 +60,54 @@ impl Engine {
         budget: &Budget,
     ) -> Result<ObjectPage, QueryError> {
         let names = self.names(on_board, wait, budget)?;
-        let snapshot = &on_board.snapshot;
-        budget.take(limit.min(snapshot.objects.len()) * size_of::<ObjectOnBoard>());
-        let unmeasured = || (0..snapshot.objects.len()).map(|_| OnceLock::new()).collect();
-        let boxes: &[OnceLock<OrientedBox>] = on_board.listed.boxes.get_or_init(unmeasured);
-        let page =
-            self.on_scene(snapshot, budget, |_, scene| page(scene, (names, boxes), filter, limit, budget));
-        budget.check().map_err(ScoreError::from)?;
+        let scene = Scene::of(&on_board.snapshot);
+        budget.take(limit.min(scene.index.len()) * size_of::<ObjectOnBoard>());
+        let unmeasured = || (0..scene.index.len()).map(|_| OnceLock::new()).collect();
+        let boxes: &[OnceLock<OrientedBox>] = on_board.boxes.get_or_init(unmeasured);
+        let page = page(&scene, (names, boxes), filter, limit, budget);
+        budget.check()?;
         Ok(page?)
     }
+}
 
-    pub fn object(
-        &self,
-        snapshot: &Snapshot,
-        names: Option<&Names>,
-        id: u64,
-        budget: &Budget,
-    ) -> Result<Option<ObjectOnBoard>, QueryError> {
-        let found = self.on_scene(snapshot, budget, |_, scene| {
-            let object = number_of(scene, id)?;
-            take_points(scene, object, budget).then(|| describe(scene, names, object, &OnceLock::new()))
-        });
-        budget.check().map_err(ScoreError::from)?;
-        Ok(found)
+impl Scene<'_> {
+    /// Returns the object with an id. Check the budget afterwards.
+    pub fn object(&self, id: u64, names: Option<&Names>, budget: &Budget) -> Option<ObjectOnBoard> {
+        let object = self.number_of(id)?;
+        take_points(self, object, budget).then(|| describe(self, names, object, &OnceLock::new()))
     }
 
     /// Returns an object's thumbnail, a JPEG file; outer `None`: no such object.
-    pub fn thumbnail(
-        &self,
-        snapshot: &Snapshot,
-        id: u64,
-        budget: &Budget,
-    ) -> Result<Option<Option<Vec<u8>>>, QueryError> {
-        let picture = self.on_scene(snapshot, budget, |_, scene| {
-            let picture = objects::thumbnail(scene, number_of(scene, id)?);
-            budget.take(picture.map_or(0, <[u8]>::len));
-            Some(picture.map(<[u8]>::to_vec))
-        });
-        budget.check().map_err(ScoreError::from)?;
-        Ok(picture)
+    pub fn thumbnail(&self, id: u64) -> Option<Option<Vec<u8>>> {
+        Some(objects::thumbnail(self, self.number_of(id)?).map(<[u8]>::to_vec))
     }
 
     /// Returns at most `limit` positions of an object's Gaussians on board, evenly spread over their order: those of
     /// its largest cluster inside the cluster's box. Some objects have nearly as many stray Gaussians as their own.
-    pub(crate) fn object_points(
-        &self,
-        snapshot: &Snapshot,
-        id: u64,
-        limit: usize,
-        budget: &Budget,
-    ) -> Vec<DVec3> {
-        self.on_scene(snapshot, budget, |_, scene| {
-            let Some(object) = number_of(scene, id) else { return Vec::new() };
-            if !take_points(scene, object, budget) {
-                return Vec::new();
-            }
-            thinned(largest_cluster(scene, object), limit)
-        })
+    pub(crate) fn object_points(&self, id: u64, limit: usize, budget: &Budget) -> Vec<DVec3> {
+        match self.number_of(id).filter(|object| take_points(self, *object, budget)) {
+            Some(object) => thinned(largest_cluster(self, object), limit),
+            None => Vec::new(),
+        }
     }
 
-    /// As [`Engine::object_points`], of an answer that lists its members.
-    pub(crate) fn answer_points(
-        &self,
-        snapshot: &Snapshot,
-        answer: &ClusterAnswer,
-        limit: usize,
-        budget: &Budget,
-    ) -> Vec<DVec3> {
-        self.on_scene(snapshot, budget, |_, scene| {
-            if !budget.take(answer.n_gaussians as usize * size_of::<DVec3>()) {
-                return Vec::new();
-            }
-            let bounds = Aabb { min: answer.box_min_in_world, max: answer.box_max_in_world };
-            thinned(points_of(scene, &answer.members, &bounds), limit)
-        })
+    /// As [`Scene::object_points`], of an answer that lists its members.
+    pub(crate) fn answer_points(&self, answer: &ClusterAnswer, limit: usize, budget: &Budget) -> Vec<DVec3> {
+        if !budget.take(answer.n_gaussians as usize * size_of::<DVec3>()) {
+            return Vec::new();
+        }
+        let bounds = Aabb { min: answer.box_min_in_world, max: answer.box_max_in_world };
+        thinned(points_of(self, &answer.members, &bounds), limit)
+    }
+
+    fn number_of(&self, id: u64) -> Option<usize> {
+        // Objects are in order of their ids.
+        let (mut low, mut high) = (0, self.index.len());
+        while low < high {
+            let middle = low.midpoint(high);
+            if objects::record(self, middle).id < id { low = middle + 1 } else { high = middle }
+        }
+        (low < self.index.len() && objects::record(self, low).id == id).then_some(low)
     }
 }
 
@@ -164,21 +137,11 @@ pub(super) fn largest_cluster(scene: &Scene<'_>, object: usize) -> Vec<DVec3> {
         alignment: alignment(scene.manifest),
         with_members: true,
     };
-    let clusters = cluster(scene.shards, &runs, &grouping, &Budget::default()).clusters;
+    let clusters = cluster(&scene.shards, &runs, &grouping, &Budget::default()).clusters;
     let Some(largest) = clusters.into_iter().max_by_key(|of| (of.n_gaussians, Reverse(of.first))) else {
         return Vec::new();
     };
     points_of(scene, &largest.members, &largest.extent.box_in_world)
-}
-
-fn number_of(scene: &Scene<'_>, id: u64) -> Option<usize> {
-    // Objects are in order of their ids.
-    let (mut low, mut high) = (0, scene.index.len());
-    while low < high {
-        let middle = low.midpoint(high);
-        if objects::record(scene, middle).id < id { low = middle + 1 } else { high = middle }
-    }
-    (low < scene.index.len() && objects::record(scene, low).id == id).then_some(low)
 }
 
 fn page(
@@ -226,7 +189,7 @@ fn page(
         named: names.is_some(),
         n_objects: all.len(),
         next_after,
-        coverage: coverage(manifest, scene.bad_cells, scene.fetched, &filter.region),
+        coverage: coverage(scene, &filter.region),
         objects,
     })
 }

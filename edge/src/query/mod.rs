@@ -31,9 +31,7 @@ mod status;
 mod view;
 
 pub use answer::answer;
-pub use answers::{
-    Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason, ReasonKind, Searched,
-};
+pub use answers::{Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Searched};
 pub use area::{Area, AreaBall, AreaBox, Corner, LatLon, Point};
 pub use ask::Ask;
 pub use changes::{ChangesError, ChangesRequest};
@@ -44,8 +42,8 @@ pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder};
 pub use listing::ListFormat;
 pub(crate) use naming::NAMES_WAIT;
 pub use page::Page;
-pub use rank::relevance;
-pub use reply::{Outcome, RelatedAnswers, Reply};
+pub use reason::{Reason, ReasonKind};
+pub use reply::Reply;
 pub use request::{
     AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, LENGTHS, MAX_CLUSTERS,
     MAX_GAUSSIANS, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, Words,

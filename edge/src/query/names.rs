@@ -54,7 +54,7 @@ impl Names {
             let question =
                 |(_, vector): &WordVector| Question { vector: Arc::clone(vector), negatives: Vec::new() };
             let questions: Vec<Question> = together.iter().map(question).collect();
-            score_objects(scene.shards, scene.objects, scene.index, &questions)
+            score_objects(&scene.shards, &scene.objects, scene.index, &questions)
         };
         let mut spread = Spread::default();
         for (_, words) in together().step_by(MEASURED) {

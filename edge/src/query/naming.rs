@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::engine::{Engine, OnBoard, QueryError};
 use super::names::{Names, Words};
+use super::scene::Scene;
 use crate::score::Budget;
 use crate::text::TextService;
 
@@ -20,7 +21,7 @@ impl Engine {
         wait: Duration,
         budget: &Budget,
     ) -> Result<Option<&'a Names>, QueryError> {
-        if let Some(names) = on_board.listed.names.get() {
+        if let Some(names) = on_board.names.get() {
             return Ok(Some(names));
         }
         if on_board.check().is_err() {
@@ -28,10 +29,10 @@ impl Engine {
         }
         let Some(words) = self.words(&on_board.text).wait(wait) else { return Ok(None) };
         let used_bytes = budget.used_bytes();
-        let made = self.on_scene(&on_board.snapshot, budget, |_, scene| Names::new(words, scene, budget));
+        let made = Names::new(words, &Scene::of(&on_board.snapshot), budget);
         budget.give_back_to(used_bytes, 0);
         let made = made?;
-        Ok(Some(on_board.listed.names.get_or_init(|| made)))
+        Ok(Some(on_board.names.get_or_init(|| made)))
     }
 
     pub(crate) fn begin_names(&self) {

@@ -164,7 +164,7 @@ fn points<'a>(scene: &'a Scene<'_>, part: Part, region: &'a Region) -> impl Iter
     members.map(|i| shard.position_in_world(i as usize)).filter(|point| region.contains(*point))
 }
 
-fn of_part<'a>(scene: &Scene<'a>, part: Part) -> &'a Objects<'a> {
+fn of_part<'s, 'a>(scene: &'s Scene<'a>, part: Part) -> &'s Objects<'a> {
     match &scene.objects[part.shard as usize] {
         Some(objects) => objects,
         None => unreachable!("only shards with objects have parts"),

@@ -18,13 +18,7 @@ pub fn box_around(
 ) -> OrientedBox {
     let inside: Vec<DVec3> = points.iter().copied().filter(core).collect();
     let axes = axes_of(&inside, alignment);
-    let mut values = Vec::with_capacity(points.len());
-    let (mut min, mut max) = (DVec3::ZERO, DVec3::ZERO);
-    for axis in 0..3 {
-        values.clear();
-        values.extend(points.iter().map(|point| axes.col(axis).dot(*point)));
-        (min[axis], max[axis]) = trimmed_range(&mut values, trimmed).unwrap_or_default();
-    }
+    let Aabb { min, max } = trimmed_box(points, trimmed, |axis, point| axes.col(axis).dot(point));
     let (axes, min, max) = longest_first(axes, min, max, alignment);
     OrientedBox {
         centre_in_world: axes * ((min + max) * 0.5),
@@ -91,7 +85,7 @@ pub struct Extent {
 impl Extent {
     /// At least one point is required.
     pub fn of(points: &[DVec3]) -> Self {
-        let box_in_world = trimmed_box(points);
+        let box_in_world = trimmed_box(points, TRIMMED, |axis, point| point[axis]);
         let inside = points.iter().filter(|point| box_in_world.contains(**point));
         let (sum, n) = inside.fold((DVec3::ZERO, 0u64), |(sum, n), point| (sum + *point, n + 1));
         // Trimming excludes at most 4 % per axis, so some point is inside along all three.
@@ -99,13 +93,14 @@ impl Extent {
     }
 }
 
-fn trimmed_box(points: &[DVec3]) -> Aabb {
+/// Returns the `trimmed` to `1 - trimmed` quantiles of the points' coordinates along each axis.
+fn trimmed_box(points: &[DVec3], trimmed: f64, coordinate: impl Fn(usize, DVec3) -> f64) -> Aabb {
     let (mut min, mut max) = (DVec3::ZERO, DVec3::ZERO);
     let mut values = Vec::with_capacity(points.len());
     for axis in 0..3 {
         values.clear();
-        values.extend(points.iter().map(|point| point[axis]));
-        (min[axis], max[axis]) = trimmed_range(&mut values, TRIMMED).unwrap_or_default();
+        values.extend(points.iter().map(|point| coordinate(axis, *point)));
+        (min[axis], max[axis]) = trimmed_range(&mut values, trimmed).unwrap_or_default();
     }
     Aabb { min, max }
 }

@@ -8,9 +8,10 @@ use serde::Serialize;
 use slag_api::coverage::Coverage;
 use slag_api::{FRAME, UNITS};
 
-use super::answers::{ClusterAnswer, Found, GaussianAnswer, Reason, ReasonKind, Searched};
+use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, Searched};
+use super::reason::{Reason, ReasonKind};
 use super::relations::{self, Phrase, Witness};
-use super::reply::{Outcome, Reply};
+use super::reply::Reply;
 use super::request::{AnswerKind, Asked};
 use super::scene::unit;
 
@@ -138,13 +139,13 @@ impl<'a> Page<'a> {
     /// Describes a reply with the answers of its page.
     pub fn of(reply: &'a Reply) -> Self {
         let manifest = reply.manifest();
-        let results = reply.request.asked.iter().zip(&reply.outcomes);
+        let results = reply.request.asked.iter().zip(&reply.answers);
         Self {
             scene: &manifest.scene,
             generation: manifest.generation,
             frame: FRAME,
             unit: unit(manifest),
-            results: results.map(|(asked, outcome)| Described::new(reply, asked, outcome)).collect(),
+            results: results.map(|(asked, found)| Described::new(reply, asked, found)).collect(),
         }
     }
 }
@@ -165,48 +166,36 @@ impl<'a> AskedFor<'a> {
 }
 
 impl<'a> Described<'a> {
-    fn new(reply: &Reply, asked: &'a Asked, outcome: &'a Outcome) -> Self {
+    fn new(reply: &Reply, asked: &'a Asked, found: &'a Answers) -> Self {
         let (question, understood) = AskedFor::new(asked);
         let (offset, limit) = (reply.request.offset, reply.request.page());
         let end = offset.saturating_add(limit);
-        let page = Self {
-            question,
-            understood,
-            asked_as: outcome.asked_as(),
-            kind: AnswerKind::Objects,
-            searched: None,
-            coverage: outcome.coverage(),
-            parts: None,
-            none: None,
-            next_offset: (outcome.len() > end).then_some(end),
-            answers: Vec::new(),
-        };
         let generation = reply.manifest().generation;
-        let thing = |cluster, degree, related_to| {
+        let related = found.related.as_ref();
+        let thing = |(at, cluster): (usize, &'a ClusterAnswer)| {
+            let to = related.map(|related| &related.to[at]);
+            let (degree, related_to) = (to.map(|to| to.0), to.map(|to| &*to.1));
             let of = AnsweredThing { cluster, degree, related_to };
             Answer::Thing(InFrame { frame: FRAME, generation, of })
         };
-        match outcome {
-            Outcome::Plain(answers) => {
-                let list = match &answers.answers {
-                    Found::Clusters(clusters) => {
-                        let page = clusters.iter().skip(offset).take(limit);
-                        page.map(|cluster| thing(cluster, None, None)).collect()
-                    }
-                    Found::Gaussians(_) => {
-                        let page = reply.gaussians(answers).into_iter().skip(offset).take(limit);
-                        page.map(|of| Answer::Gaussian(InFrame { frame: FRAME, generation, of })).collect()
-                    }
-                };
-                let (searched, none) = (Some(&answers.searched), answers.reason.as_ref().map(Nothing::new));
-                Self { kind: answers.kind, searched, none, answers: list, ..page }
+        let gaussian = |of| Answer::Gaussian(InFrame { frame: FRAME, generation, of });
+        let answers = match &found.answers {
+            Found::Clusters(of) => of.iter().enumerate().skip(offset).take(limit).map(thing).collect(),
+            Found::Gaussians(_) => {
+                reply.gaussians(found).into_iter().skip(offset).take(limit).map(gaussian).collect()
             }
-            Outcome::Related(related) => {
-                let list = related.answers.iter().skip(offset).take(limit);
-                let list = list.map(|(cluster, degree, to)| thing(cluster, Some(*degree), Some(&**to)));
-                let (parts, none) = (Some(&*related.parts), related.miss.as_ref().map(Nothing::new));
-                Self { parts, none, answers: list.collect(), ..page }
-            }
+        };
+        Self {
+            question,
+            understood,
+            asked_as: &found.asked_as,
+            kind: found.kind,
+            searched: related.is_none().then_some(&found.searched),
+            coverage: &found.coverage,
+            parts: related.map(|related| &*related.parts),
+            none: found.reason.as_ref().map(Nothing::new),
+            next_offset: (found.answers.len() > end).then_some(end),
+            answers,
         }
     }
 }

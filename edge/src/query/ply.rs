@@ -1,7 +1,7 @@
 //! The Gaussians of a reply as a PLY of points, in pieces of bounded size.
 
-use std::borrow::Borrow;
 use std::io;
+use std::sync::Arc;
 
 use slag_common::splat::ply::{Point, PointProperties};
 
@@ -14,8 +14,8 @@ use crate::score::Run;
 const PIECE_BYTES: usize = 256 << 10;
 
 /// The pieces of a reply as a PLY. Points are ordered by question, answer, and storage.
-pub struct Pieces<R> {
-    reply: R,
+pub struct Pieces {
+    reply: Arc<Reply>,
     properties: PointProperties,
     has_header: bool,
     at: Place,
@@ -30,33 +30,30 @@ struct Place {
     member: u32,
 }
 
-impl<R: Borrow<Reply>> Pieces<R> {
-    pub fn new(reply: R) -> Self {
+impl Pieces {
+    pub fn new(reply: Arc<Reply>) -> Self {
         let properties = PointProperties {
-            question: reply.borrow().outcomes.len() != 1,
+            question: reply.answers.len() != 1,
             shard_index: true,
-            input_index: reply.borrow().snapshot.shards.iter().all(|shard| shard.view().has_input_indices()),
+            input_index: reply.snapshot.shards.iter().all(|shard| shard.view().has_input_indices()),
         };
         Self { reply, properties, has_header: false, at: Place::default() }
     }
 
     fn header(&self) -> String {
-        let reply = self.reply.borrow();
-        let manifest = &reply.snapshot.manifest;
-        let unit = unit(manifest);
-        let mut comments: Vec<String> =
-            reply.answers().map(|answers| format!("text {}", answers.text)).collect();
-        comments.push(format!("scene {}", manifest.scene));
-        comments.push(format!("generation {}", manifest.generation));
-        comments.push(format!("unit {unit}"));
-        self.properties.header(reply.answers().map(n_points).sum(), &comments)
+        let (answers, manifest) = (self.reply.answers.iter(), self.reply.manifest());
+        let (scene, generation, unit) = (&manifest.scene, manifest.generation, unit(manifest));
+        let about = [format!("scene {scene}"), format!("generation {generation}"), format!("unit {unit}")];
+        let texts = answers.clone().map(|answers| format!("text {}", answers.text));
+        let comments: Vec<String> = texts.chain(about).collect();
+        self.properties.header(answers.map(n_points).sum(), &comments)
     }
 
     /// Appends points to a piece until it is full or none is left.
     fn fill(&mut self, piece: &mut Vec<u8>) {
-        let reply = self.reply.borrow();
+        let reply = &self.reply;
         let shards: Vec<_> = reply.snapshot.shards.iter().map(|shard| shard.view()).collect();
-        while let Some(answers) = reply.answers().nth(self.at.question) {
+        while let Some(answers) = reply.answers.get(self.at.question) {
             let Some(run) = run(answers, self.at.answer, self.at.run) else {
                 self.at = match self.at.answer + 1 < answers.answers.len() {
                     true => Place { answer: self.at.answer + 1, run: 0, member: 0, ..self.at },
@@ -85,7 +82,7 @@ impl<R: Borrow<Reply>> Pieces<R> {
     }
 }
 
-impl<R: Borrow<Reply>> Iterator for Pieces<R> {
+impl Iterator for Pieces {
     type Item = io::Result<Vec<u8>>;
 
     fn next(&mut self) -> Option<Self::Item> {

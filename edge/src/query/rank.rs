@@ -9,16 +9,8 @@ use super::scene::default_voxel;
 /// Distance, in default voxels, at which an answer's relevance is halved (10 m in a metric scene).
 const VOXELS_TO_HALF_RELEVANCE: f64 = 40.0;
 
-/// Returns the ranking key of an answer: `(score - base) / (1 + distance / half)`, and 0 below `base`.
-///
-/// `base`: the score of an unrelated thing. Neither the threshold, which only filters, nor another parameter changes
-/// it. Rounded to f32 to hide the last bits of a machine's division.
-pub fn relevance(score: f32, base: f32, distance: Option<f64>, half: f64) -> f32 {
-    let margin = (f64::from(score) - f64::from(base)).max(0.0);
-    (margin / (1.0 + distance.unwrap_or(0.0) / half)) as f32
-}
-
 pub struct Order {
+    /// The score of an unrelated thing.
     base: f32,
     half: f64,
     near: Option<DVec3>,
@@ -39,11 +31,15 @@ impl Order {
     }
 
     /// Ranks answers, ties in their given order, and keeps as many as asked for. `key`: reported score and position.
+    ///
+    /// The ranking key, `(score - base) / (1 + distance / half)`, and 0 below `base`, depends neither on the threshold,
+    /// which only filters, nor on another parameter. It is rounded to f32 to hide the last bits of a machine's division.
     pub fn rank<T>(&self, found: Vec<T>, key: impl Fn(&T) -> (f32, DVec3)) -> Vec<Ranked<T>> {
         let weighed = found.into_iter().map(|found| {
             let (score, position_in_world) = key(&found);
             let distance = self.near.map(|near| near.distance(position_in_world));
-            let relevance = relevance(score, self.base, distance, self.half);
+            let margin = (f64::from(score) - f64::from(self.base)).max(0.0);
+            let relevance = (margin / (1.0 + distance.unwrap_or(0.0) / self.half)) as f32;
             (score, Ranked { found, rank: 0, relevance, distance })
         });
         let mut ranked: Vec<(f32, Ranked<T>)> = weighed.collect();

@@ -3,14 +3,76 @@
 use std::ops::Range;
 
 use glam::DVec3;
+use schemars::JsonSchema;
+use serde::Serialize;
 use slag_api::coverage::Coverage;
 use slag_common::shard::ShardView;
 
-use super::answers::{Reason, ReasonKind};
 use super::request::QueryRequest;
 use super::scale::Scale;
 use super::scene::Scene;
 use crate::score::{Region, Search};
+
+/// Kind of reason for an empty answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum ReasonKind {
+    /// No Gaussian or object reaches the threshold.
+    BelowThreshold,
+    /// Gaussians or objects match, but no cluster and no object has enough Gaussians.
+    ClustersTooSmall,
+    /// The region asked for holds nothing that could match.
+    NothingThere,
+    /// Views saw less than half of the region asked for.
+    NotLookedThere,
+    /// Of a phrase: nothing on board is such a thing.
+    NoSuchThing,
+    /// Of a phrase: such things are on board, but none is so placed.
+    NoSuchPair,
+    /// Of a phrase: there are fewer of them than counted.
+    TooFew,
+    /// Of a phrase: such things are on board, but none in the region asked for.
+    NotInRegion,
+}
+
+/// Reason for an empty answer, with the nearest miss.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+pub struct Reason {
+    /// Kind.
+    pub kind: ReasonKind,
+    /// The reason in words.
+    pub detail: String,
+    /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seen_share: Option<f64>,
+    /// Best score found.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub best_score: Option<f32>,
+    /// Position of the best score.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(with = "Option<[f64; 3]>")]
+    pub best_position_in_world: Option<DVec3>,
+    /// Of a phrase: the thing that is missing, or not so placed.
+    #[serde(skip)]
+    pub thing: Option<Box<str>>,
+    /// Of a phrase: greatest degree of the relation among all pairs.
+    #[serde(skip)]
+    pub best_degree: Option<f64>,
+}
+
+impl Reason {
+    pub fn new(kind: ReasonKind, detail: String) -> Self {
+        Self {
+            kind,
+            detail,
+            seen_share: None,
+            best_score: None,
+            best_position_in_world: None,
+            thing: None,
+            best_degree: None,
+        }
+    }
+}
 
 /// Least share of a region's Gaussians in views for the region to count as seen.
 const MIN_SEEN: f64 = 0.5;
@@ -87,7 +149,7 @@ pub fn of_objects(
             "the shards on board have no objects; ask with kind=clusters, or encode the scene with objects"
                 .to_owned(),
         ),
-        None if seen_share(scene.shards, place).is_some() => {
+        None if seen_share(&scene.shards, place).is_some() => {
             let advice =
                 if request.kind.is_some() { "; ask with kind=clusters, or search elsewhere" } else { "" };
             let detail = format!("there are Gaussians{place}, but none of an object{advice}");
@@ -120,7 +182,7 @@ pub fn of_gaussians(
 ) -> Reason {
     let place = &request.region;
     let best = search.best(1, f32::NEG_INFINITY, request.near).first().map(|hit| {
-        (scale.shown(hit.score), search.shards()[hit.shard as usize].position_in_world(hit.index as usize))
+        (scale.shown(hit.score), search.shards[hit.shard as usize].position_in_world(hit.index as usize))
     });
     let (kind, detail) = match best {
         None => (

@@ -231,6 +231,8 @@ pub struct QueryRequest {
     pub min_count: u64,
     pub precision: Precision,
     pub members: bool,
+    /// Whether texts that name a relation are understood as phrases.
+    pub relations: bool,
 }
 
 impl QueryRequest {
@@ -250,6 +252,7 @@ impl QueryRequest {
             min_count: DEFAULT_MIN_COUNT,
             precision: Precision::default(),
             members: false,
+            relations: true,
         }
     }
 
@@ -258,7 +261,8 @@ impl QueryRequest {
     /// # Errors
     /// A text that breaks a phrase's limit: without its relations it would ask for something else.
     pub(super) fn understand(&mut self, snapshot: &Snapshot) -> Result<(), RequestError> {
-        if !matches!(self.kind, None | Some(AnswerKind::Objects)) || snapshot.objects.is_empty() {
+        let may_be_objects = matches!(self.kind, None | Some(AnswerKind::Objects));
+        if !self.relations || !may_be_objects || snapshot.objects.is_empty() {
             return Ok(());
         }
         for asked in &mut self.asked {

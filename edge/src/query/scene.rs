@@ -8,8 +8,8 @@ use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
 use slag_math::stats::median;
 
-use crate::store::BadCell;
 use crate::store::objects::ObjectIndex;
+use crate::store::{BadCell, Snapshot};
 
 /// Voxel edge in a metric scene, metres: parts of a piece of furniture are within two edges, two pieces mostly not.
 const METRIC_VOXEL_M: f64 = 0.25;
@@ -17,14 +17,28 @@ const METRIC_VOXEL_M: f64 = 0.25;
 const VOXELS_PER_CELL: f64 = 64.0;
 
 pub struct Scene<'a> {
-    pub shards: &'a [ShardView<'a>],
+    pub shards: Vec<ShardView<'a>>,
     /// The objects of each shard; absent in shards without them.
-    pub objects: &'a [Option<Objects<'a>>],
+    pub objects: Vec<Option<Objects<'a>>>,
     pub index: &'a ObjectIndex,
     pub manifest: &'a Manifest,
+    /// Centre and radius of the area on board.
     pub fetched: (DVec3, f64),
     /// Cells whose shards could not be fetched.
     pub bad_cells: &'a [BadCell],
+}
+
+impl<'a> Scene<'a> {
+    pub fn of(snapshot: &'a Snapshot) -> Self {
+        Self {
+            shards: snapshot.shards.iter().map(|shard| shard.view()).collect(),
+            objects: snapshot.shards.iter().map(|shard| shard.additions().objects).collect(),
+            index: &snapshot.objects,
+            manifest: &snapshot.manifest,
+            fetched: (snapshot.current.centre_in_world, snapshot.current.radius),
+            bad_cells: &snapshot.bad_cells,
+        }
+    }
 }
 
 pub fn unit(manifest: &Manifest) -> &'static str {

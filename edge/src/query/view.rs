@@ -10,8 +10,9 @@ use slag_view::{
 use super::engine::{Engine, QueryError};
 use super::naming::NAMES_WAIT;
 use super::request::{Negatives, QueryRequest};
+use super::scene::Scene;
 use super::status::map_status;
-use crate::score::{Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy};
+use crate::score::{Budget, Precision, Question, Region, ScoreError, Search, relevancy};
 use crate::store::Snapshot;
 
 /// Below every cosine, and below every difference of two cosines.
@@ -29,7 +30,7 @@ impl Engine {
         let photos = snapshot.shards.iter().filter_map(|shard| shard.additions().photo_poses);
         let n_photos: usize = photos.map(|photos| photos.iter().count()).sum();
         budget.take(n_photos * size_of::<Photo>() + snapshot.manifest.cells.len() * size_of::<Cell>());
-        budget.check().map_err(ScoreError::from)?;
+        budget.check()?;
         let can_ask = on_board.check().is_ok();
         let map = map_status(snapshot, 0, None);
         let known = map.cells.iter().map(|cell| Cell {
@@ -83,7 +84,7 @@ impl Engine {
         let view = shard.view();
         let sent = step.indices(view.header.n_gaussians as usize);
         budget.take(CELL_HEAD_BYTES + sent.len() * (GAUSSIAN_BYTES + size_of::<DVec3>()));
-        budget.check().map_err(ScoreError::from)?;
+        budget.check()?;
         let positions: Vec<DVec3> = sent.map(|at| view.position_in_world(at)).collect();
         Ok(Some(cell_message(&positions, shard.additions().appearance, step)))
     }
@@ -111,29 +112,25 @@ impl Engine {
         request.check()?;
         let on_board = self.on_board()?;
         on_board.check()?;
-        let snapshot = &on_board.snapshot;
         let question =
             Question { vector: on_board.encode(&text)?, negatives: on_board.encode_negatives(&request)? };
-        let generation = snapshot.manifest.generation;
-        let message = self.on_scene(snapshot, budget, |scratch, scene| {
-            scores_message(scratch, scene.shards, &question, generation)
-        });
-        Ok(message?)
+        let scene = Scene::of(&on_board.snapshot);
+        Ok(scores_message(&scene.shards, &question, scene.manifest.generation, budget)?)
     }
 }
 
 fn scores_message(
-    scratch: &mut Scratch,
     shards: &[ShardView<'_>],
     question: &Question,
     generation: u64,
+    budget: &Budget,
 ) -> Result<Vec<u8>, ScoreError> {
-    let budget = scratch.budget().clone();
     let cells: Vec<(u32, u32)> =
         shards.iter().map(|shard| (shard.header.cell_id, shard.header.n_gaussians)).collect();
     budget.take(ScoresMessage::len(cells.len(), cells.iter().map(|(_, n)| *n as usize).sum()));
-    let search = Search::reusing(scratch, shards, question, Region::default(), Precision::Centroids)?;
-    let mut runs = search.matching(BELOW_ALL).runs;
+    let (questions, everywhere) = (std::slice::from_ref(question), Region::default());
+    let searches = Search::batch(shards, questions, &everywhere, Precision::Centroids, budget)?;
+    let mut runs = searches[0].matching(BELOW_ALL).runs;
     budget.check()?;
     if !question.negatives.is_empty() {
         runs.iter_mut().for_each(|run| run.score = relevancy(run.score));

@@ -1,13 +1,14 @@
 //! One question's view of one shard: the data that decide members' scores, and bounds on those scores.
 
 use half::f16;
+use rayon::prelude::*;
 use slag_common::shard::{ExactColumns, Residuals, ShardView};
 use slag_math::simd::InstructionSet;
 
-use super::centroids::{AskedQuestion, ShardScores};
 use super::project::Projection;
 use super::question::Precision;
 use super::region::Region;
+use super::search::{Search, ShardScores};
 
 /// Number of mean measured errors within which a score is undecided and refined. With 9, answers hold 0.99 and more
 /// of a generated field's best 1,000 to 100,000; with 6, the best 1,000 of a few texts fall short, because so few
@@ -56,7 +57,7 @@ impl<'a> Measured<'a> {
 pub(super) struct Cell<'a> {
     pub at: u32,
     pub shard: &'a ShardView<'a>,
-    pub asked: &'a AskedQuestion<'a>,
+    pub asked: &'a Search<'a>,
     pub scores: &'a ShardScores,
     /// `[K]`: the question's score of each centroid.
     pub centroids: &'a [f32],
@@ -72,17 +73,10 @@ pub(super) struct Cell<'a> {
     table_reach: f32,
 }
 
-impl<'a> AskedQuestion<'a> {
+impl<'a> Search<'a> {
     /// Returns the question's view of a shard; `None` if the shard was not searched.
     pub(super) fn cell(&'a self, at: usize) -> Option<Cell<'a>> {
-        let (shard, scores) = (&self.shards[at], &self.scored.shards[at]);
-        if !scores.is_searched {
-            return None;
-        }
-        let centroids = match self.places.len() {
-            1 => &scores.centroids[self.places[0]],
-            _ => &scores.combined[self.index],
-        };
+        let (shard, scores) = (&self.shards[at], self.scored[at].as_ref()?);
         let detail = match (&shard.exact, &shard.residuals) {
             _ if self.precision == Precision::Centroids => Detail::Nothing,
             // Codes with unmeasured errors cannot decide.
@@ -102,7 +96,7 @@ impl<'a> AskedQuestion<'a> {
             shard,
             asked: self,
             scores,
-            centroids,
+            centroids: &scores.combined[self.index],
             detail,
             filter,
             instructions: InstructionSet::widest(),
@@ -114,6 +108,15 @@ impl<'a> AskedQuestion<'a> {
             cell.measure(residuals);
         }
         Some(cell)
+    }
+
+    /// Bounds every score's difference from the score of any embedding that the centroid or Gaussian represents.
+    pub fn score_error_bound(&self) -> f32 {
+        let of_cell = |cell: Cell<'_>| {
+            (0..cell.centroids.len()).map(|centroid| cell.score_error(centroid)).fold(0.0, f32::max)
+        };
+        let cells = (0..self.shards.len()).into_par_iter().filter_map(|at| self.cell(at));
+        cells.map(of_cell).reduce(|| 0.0, f32::max)
     }
 }
 

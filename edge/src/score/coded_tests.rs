@@ -49,12 +49,11 @@ fn shards_of(
 
 /// Scores a Gaussian by the definitions of format and module, from the rounded parts.
 fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
-    let shard = &search.shards()[shard_at];
-    let (centroid, scores) = (shard.centroid_of(index), &search.asked.scored.shards[shard_at]);
+    let shard = &search.shards[shard_at];
+    let (centroid, scores) = (shard.centroid_of(index), search.scored[shard_at].as_ref().expect("searched"));
     let product = |place: &usize| {
         let own = scores.centroids[*place][centroid];
-        let Some(residuals) = shard.residuals.filter(|_| search.asked.precision != Precision::Centroids)
-        else {
+        let Some(residuals) = shard.residuals.filter(|_| search.precision != Precision::Centroids) else {
             return own;
         };
         let (tables, scale) = (&scores.projections[*place].tables, residuals.residual_scales[centroid]);
@@ -65,7 +64,7 @@ fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
         let sum: u32 = (0..shard.header.n_subspaces as usize).map(value).sum();
         (own + scale * tables.offset) + scale * tables.step * sum as f32
     };
-    let products: Vec<f32> = search.asked.places.iter().map(product).collect();
+    let products: Vec<f32> = search.places.iter().map(product).collect();
     let worst = products[1..].iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if products.len() > 1 { products[0] - worst } else { products[0] }
 }
@@ -83,7 +82,7 @@ fn scores_are_within_the_stated_error() {
             for precision in [Precision::Exact, Precision::Centroids] {
                 let search = Search::new(&views, &question, Region::default(), precision).expect("valid");
                 for (at, (shard, built)) in views.iter().zip(&built).enumerate() {
-                    let cell = search.asked.cell(at).expect("searched");
+                    let cell = search.cell(at).expect("searched");
                     for (index, embedding) in built.embeddings.iter().enumerate() {
                         let centroid = shard.centroid_of(index);
                         let found = f64::from(defined_score(&search, at, index));
@@ -97,7 +96,7 @@ fn scores_are_within_the_stated_error() {
                         let bound = cell.score_error(centroid);
                         let of_rounding = match (&shard.residuals, precision) {
                             (Some(_), Precision::Centroids) => cell.centroid_error(centroid),
-                            _ => bound - search.asked.steepness * shard.radii[centroid],
+                            _ => bound - search.steepness * shard.radii[centroid],
                         };
                         let share = rounding / f64::from(of_rounding);
                         assert!(
@@ -123,8 +122,6 @@ fn scores_are_within_the_stated_error() {
 fn answers_are_those_of_brute_force() {
     let mut random = Random::new(22);
     let (mut n_scanned, mut n_all) = (0, 0);
-    // Buffers of other scenes, precisions and questions must not leak into an answer.
-    let mut scratch = Scratch::default();
     for shape in SHAPES {
         let built = shards(&mut random, shape);
         let views = views(&built);
@@ -138,10 +135,9 @@ fn answers_are_those_of_brute_force() {
             let question = random_question(&mut random, shape.0, n_negatives);
             let ball = Ball { centre_in_world: DVec3::new(11.0, 5.0, 5.0), radius: 6.0 };
             let region = Region { ball: is_near.then_some(ball), bounds: None, polygon: None };
-            let search =
-                Search::reusing(&mut scratch, &views, &question, region.clone(), precision).expect("valid");
+            let search = Search::new(&views, &question, region.clone(), precision).expect("valid");
             let mut all: Vec<Hit> = Vec::new();
-            for (at, view) in views.iter().enumerate().filter(|(at, _)| search.asked.cell(*at).is_some()) {
+            for (at, view) in views.iter().enumerate().filter(|(at, _)| search.cell(*at).is_some()) {
                 let inside = |index: &usize| region.contains(view.position_in_world(*index));
                 let hit = |index: usize| {
                     let score = defined_score(&search, at, index);
@@ -166,7 +162,7 @@ fn answers_are_those_of_brute_force() {
                     assert_eq!((found.shard, found.index), (expected.shard, expected.index));
                     // A centroid that matches as a whole reports its own score.
                     let centroid = views[found.shard as usize].centroid_of(found.index as usize);
-                    let cell = search.asked.cell(found.shard as usize).expect("searched");
+                    let cell = search.cell(found.shard as usize).expect("searched");
                     assert!(found.score == expected.score || found.score == cell.centroids[centroid]);
                 }
                 n_scanned += matches.effort.n_rescored;
@@ -209,7 +205,7 @@ fn measured_errors_decide_as_defined() {
                 let (shard, mut decoded) = (&views[at], vec![0.0; shape.0]);
                 let exact = shard.exact.expect("exact");
                 shard.decode_fine(index, &exact.fine.expect("fine"), &mut decoded);
-                let cell = search.asked.cell(at).expect("searched");
+                let cell = search.cell(at).expect("searched");
                 let (centroid, fine) =
                     (shard.centroid_of(index), score_in_f64(&question, decoded.iter().copied()));
                 let (of_centroid, bound) =

@@ -7,11 +7,11 @@ use rayon::prelude::*;
 use slag_common::shard::{BLOCK, Residuals, ShardView};
 
 use super::cell::{Cell, Detail, Measured};
-use super::centroids::{AskedQuestion, combine};
 use super::dot::EmbeddingTimesVector;
 use super::matches::{Matches, Run};
 use super::region::Region;
-use super::simd::{BlockSums, FindSums, LastBlock, SomeRowsTimesVector};
+use super::search::{Search, combine};
+use super::simd::{BlockSums, FindSums, LastBlock, RowsTimesVector};
 
 /// Number of bins; counting locates a rank's score before anything is sorted.
 pub(super) const BINS: usize = 4096;
@@ -29,13 +29,6 @@ pub(super) fn edge_of(bin: usize) -> f32 {
     if bin == 0 { f32::NEG_INFINITY } else { edge - 4.0 * f32::EPSILON }
 }
 
-/// Runs found so far, and buffers reused between answers.
-#[derive(Default)]
-pub(super) struct Gather {
-    /// By index in the slice of shards.
-    pub shards: Vec<ShardGather>,
-}
-
 #[derive(Clone, Copy)]
 pub(super) struct Cut {
     pub score: f32,
@@ -43,14 +36,16 @@ pub(super) struct Cut {
     pub least: f32,
 }
 
+/// What was found in a shard, and buffers.
 #[derive(Default)]
-pub(super) struct ShardGather {
+pub(super) struct Gather {
     pub found: Matches,
     /// Code sums of the block read last, by vector of the question.
     last: Vec<LastBlock>,
     /// Members of one centroid whose code sum reaches the minimum.
     sums: Vec<(u32, u16)>,
     refine: Refine,
+    /// Whether matches are only counted, by their scores' bins.
     is_counting: bool,
     /// Number of scores in each bin; empty if there is none.
     pub bins: Vec<u32>,
@@ -64,42 +59,53 @@ struct Refine {
     /// Undecided members: index in `members`, and the score of the code.
     undecided: Vec<(usize, f32)>,
     which: Vec<u32>,
-    products: Vec<i32>,
     /// `[vectors][undecided]`.
     scores: Vec<f32>,
 }
 
-impl AskedQuestion<'_> {
+impl Search<'_> {
+    /// Returns the Gaussians with scores at or above a threshold, as far as the shards' data decide.
+    pub fn matching(&self, threshold: f32) -> Matches {
+        let mut all = Matches::default();
+        for Gather { found, .. } in self.collect(Cut { score: threshold, least: threshold }, false) {
+            all.runs.extend_from_slice(&found.runs);
+            all.n_gaussians += found.n_gaussians;
+            all.n_centroids_undecided += found.n_centroids_undecided;
+            all.effort += found.effort;
+            all.n_shards_below += found.n_shards_below;
+        }
+        all
+    }
+
     /// Gathers the Gaussians that reach a threshold. `each`: scores members individually wherever the shard can.
-    pub(super) fn collect(&self, gather: &mut Gather, cut: Cut, each: bool) {
-        gather.shards.resize_with(self.shards.len(), ShardGather::default);
-        gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
-            gather.found.clear();
-            gather.is_counting = false;
-            if let Some(cell) = self.cell(at).filter(|_| self.budget.goes_on()) {
-                cell.collect(gather, cut, each, f32::NEG_INFINITY);
-                self.budget.take(size_of_val(&gather.found.runs[..]));
-            }
-        });
+    pub(super) fn collect(&self, cut: Cut, each: bool) -> Vec<Gather> {
+        self.gather(|cell, gather| cell.collect(gather, cut, each, f32::NEG_INFINITY))
     }
 
     /// Counts the Gaussians that reach a threshold by their own scores, in centroids that score at least `floor`.
-    pub(super) fn count(&self, gather: &mut Gather, threshold: f32, floor: f32) {
-        gather.shards.resize_with(self.shards.len(), ShardGather::default);
-        gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
-            gather.found.clear();
+    pub(super) fn count(&self, threshold: f32, floor: f32) -> Vec<Gather> {
+        self.gather(|cell, gather| {
             gather.is_counting = true;
-            gather.bins.clear();
+            cell.collect(gather, Cut { score: threshold, least: threshold }, true, floor);
+        })
+    }
+
+    /// Works through the cells in parallel; returns what was found, by shard.
+    fn gather(&self, work: impl Fn(&Cell<'_>, &mut Gather) + Sync) -> Vec<Gather> {
+        let of_shard = |at: usize| {
+            let mut gather = Gather::default();
             if let Some(cell) = self.cell(at).filter(|_| self.budget.goes_on()) {
-                cell.collect(gather, Cut { score: threshold, least: threshold }, true, floor);
+                work(&cell, &mut gather);
+                self.budget.take(size_of_val(&gather.found.runs[..]));
             }
-        });
+            gather
+        };
+        (0..self.shards.len()).into_par_iter().map(of_shard).collect()
     }
 }
 
 impl Cell<'_> {
-    fn collect(&self, gather: &mut ShardGather, cut: Cut, each: bool, floor: f32) {
-        gather.last.clear();
+    fn collect(&self, gather: &mut Gather, cut: Cut, each: bool, floor: f32) {
         gather.last.resize_with(self.asked.places.len(), LastBlock::default);
         let margin = match self.detail {
             Detail::Measured(Measured { code_margin, .. }) if !gather.is_counting => code_margin,
@@ -143,7 +149,7 @@ impl Cell<'_> {
         gather.found.n_shards_below = usize::from(!is_reachable);
     }
 
-    fn push(&self, gather: &mut ShardGather, members: Range<usize>, score: f32) {
+    fn push(&self, gather: &mut Gather, members: Range<usize>, score: f32) {
         if gather.is_counting {
             gather.bins.resize(BINS, 0);
             gather.bins[bin_of(score)] += members.len() as u32;
@@ -154,7 +160,7 @@ impl Cell<'_> {
         gather.found.runs.push(Run { shard: self.at, start, end, score });
     }
 
-    fn rescore(&self, gather: &mut ShardGather, embeddings: &[f16], members: Range<usize>, threshold: f32) {
+    fn rescore(&self, gather: &mut Gather, embeddings: &[f16], members: Range<usize>, threshold: f32) {
         gather.found.effort.n_rescored += members.len() as u64;
         gather.found.effort.n_embeddings_read += members.len() as u64;
         for at in members {
@@ -176,7 +182,7 @@ impl Cell<'_> {
     /// Scores members of a centroid by their codes; those that reach the threshold go to `gather.refine`.
     fn scan(
         &self,
-        gather: &mut ShardGather,
+        gather: &mut Gather,
         residuals: &Residuals<'_>,
         centroid: usize,
         members: Range<usize>,
@@ -184,7 +190,7 @@ impl Cell<'_> {
     ) {
         gather.found.effort.n_rescored += members.len() as u64;
         gather.refine.members.clear();
-        let ShardGather { last, sums, refine, .. } = gather;
+        let Gather { last, sums, refine, .. } = gather;
         let [first, others @ ..] = &mut last[..] else { return };
         let places = &self.asked.places;
         let tables = &self.scores.projections[places[0]].tables;
@@ -231,8 +237,8 @@ impl Cell<'_> {
         LastBlock { block: Some(block), sums: self.instructions.dispatch(work) }
     }
 
-    fn push_scanned(&self, gather: &mut ShardGather) {
-        let ShardGather { refine, found, bins, is_counting, .. } = gather;
+    fn push_scanned(&self, gather: &mut Gather) {
+        let Gather { refine, found, bins, is_counting, .. } = gather;
         if *is_counting {
             bins.resize(BINS, 0);
             refine.members.iter().for_each(|(_, score)| bins[bin_of(*score)] += 1);
@@ -244,9 +250,9 @@ impl Cell<'_> {
     }
 
     /// Refines the scores of undecided members by fine residuals and embeddings, and drops non-matches.
-    fn refine(&self, gather: &mut ShardGather, measured: &Measured<'_>, centroid: usize, cut: Cut) {
-        let ShardGather { refine, found, .. } = gather;
-        let Refine { members, undecided, which, products, scores } = refine;
+    fn refine(&self, gather: &mut Gather, measured: &Measured<'_>, centroid: usize, cut: Cut) {
+        let Gather { refine, found, .. } = gather;
+        let Refine { members, undecided, which, scores } = refine;
         undecided.clear();
         which.clear();
         for (place, (at, score)) in members.iter().enumerate() {
@@ -260,20 +266,17 @@ impl Cell<'_> {
             scores.clear();
             for place in &self.asked.places {
                 let rounded = &self.scores.projections[*place].fine;
-                let n_components = self.shard.header.n_components as usize;
-                let (rows, vector) = (fine.values, &rounded.steps[..]);
-                self.instructions.dispatch(SomeRowsTimesVector {
-                    rows,
-                    n_components,
-                    vector,
+                let products = self.instructions.dispatch(RowsTimesVector {
+                    rows: fine.values,
+                    n_components: self.shard.header.n_components as usize,
+                    vector: &rounded.steps,
                     which,
-                    products,
                 });
                 let (own, step) = (
                     self.scores.centroids[*place][centroid],
                     f64::from(fine.scales[centroid]) * rounded.step,
                 );
-                scores.extend(products.iter().map(|product| own + (step * f64::from(*product)) as f32));
+                scores.extend(products.into_iter().map(|product| own + (step * f64::from(product)) as f32));
             }
             for (number, (place, _)) in undecided.iter().enumerate() {
                 let mut products = scores[number..].iter().step_by(which.len()).copied();

@@ -32,14 +32,6 @@ pub struct Matches {
     pub n_shards_below: usize,
 }
 
-impl Matches {
-    pub fn clear(&mut self) {
-        let mut runs = std::mem::take(&mut self.runs);
-        runs.clear();
-        *self = Self { runs, ..Self::default() };
-    }
-}
-
 /// Work done beyond scoring centroids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {

@@ -15,7 +15,6 @@
 
 mod budget;
 mod cell;
-mod centroids;
 mod collect;
 mod dot;
 mod matches;
@@ -33,7 +32,7 @@ pub use matches::{Effort, Hit, Matches, Run};
 pub use objects::{ObjectScores, score_objects};
 pub use question::{Precision, Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 pub use region::{Ball, MAX_CORNERS, Polygon, Region};
-pub use search::{Scratch, Search};
+pub use search::Search;
 
 #[cfg(test)]
 mod coded_tests;

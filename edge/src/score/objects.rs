@@ -11,10 +11,10 @@ use slag_common::shard::ShardView;
 use slag_math::simd::InstructionSet;
 
 use super::budget::ScoreError;
-use super::centroids::{combine, distinct};
 use super::project::{Projection, Vector, up};
 use super::question::{Question, check};
-use super::simd::SomeRowsTimesVector;
+use super::search::{combine, distinct};
+use super::simd::RowsTimesVector;
 use crate::store::objects::ObjectIndex;
 
 /// Objects scored at a time; their products stay in the L1 cache.
@@ -40,14 +40,6 @@ pub fn score_objects(
 ) -> Result<Vec<ObjectScores>, ScoreError> {
     check(shards, questions)?;
     let (vectors, places) = distinct(questions);
-    let vectors: Vec<Vector> = vectors
-        .into_iter()
-        .map(|values| {
-            let mut vector = Vector::default();
-            vector.set(values);
-            vector
-        })
-        .collect();
     let instructions = InstructionSet::widest();
     let of_shard = |(at, objects): (usize, &Option<Objects<'_>>)| -> Vec<ObjectScores> {
         let Some(objects) = objects else { return Vec::new() };
@@ -88,27 +80,19 @@ fn of_vector(
     which: &[(u32, u32)],
     vector: &Vector,
 ) -> ObjectScores {
-    let mut projection = Projection::default();
-    projection.set(instructions, shard, vector);
+    let projection = Projection::new(instructions, shard, vector);
     let (n_vectors, n_components) = (objects.header.n_vectors, shard.header.n_components as usize);
     let mut scores = Vec::with_capacity(which.len());
-    let (mut rows, mut products, mut largest_step) = (Vec::new(), Vec::new(), 0.0f32);
+    let mut largest_step = 0.0f32;
     for which in which.chunks(TOGETHER) {
-        rows.clear();
-        rows.extend(which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors));
-        let vector = &projection.rounded.steps[..];
-        products.clear();
-        // Vectors without components equal the mean.
-        match n_components {
-            0 => products.resize(rows.len(), 0),
-            _ => instructions.dispatch(SomeRowsTimesVector {
-                rows: objects.vectors,
-                n_components,
-                vector,
-                which: &rows,
-                products: &mut products,
-            }),
-        }
+        let rows = which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors);
+        let rows: Vec<u32> = rows.collect();
+        let products = instructions.dispatch(RowsTimesVector {
+            rows: objects.vectors,
+            n_components,
+            vector: &projection.rounded.steps,
+            which: &rows,
+        });
         for (rows, products) in rows.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize)) {
             let mut cosines = [0.0; MAX_VECTORS as usize];
             for ((cosine, row), product) in cosines.iter_mut().zip(rows).zip(products) {
@@ -214,8 +198,7 @@ mod tests {
                 let alone = score_objects(&shards, &objects, &index, std::slice::from_ref(question));
                 assert_eq!(alone.expect("scores"), std::slice::from_ref(found));
             }
-            let mut vector = Vector::default();
-            vector.set(&questions[0].vector);
+            let vector = Vector::new(&questions[0].vector);
             let at = |instructions: InstructionSet| {
                 let objects = objects[0].as_ref().expect("has objects");
                 of_vector(instructions, &shards[0], objects, index.first_in(0), &vector)

@@ -10,11 +10,11 @@
 //! residual by at most `|q - q^| |residual| + residual_scale * sum over subspaces of the largest rounding
 //! error in each`.
 
-use slag_common::shard::{BLOCK, CODEWORDS, Fine, Residuals, ShardView};
+use slag_common::shard::{BLOCK, CODEWORDS, Residuals, ShardView};
 use slag_math::simd::InstructionSet;
 
 use super::dot::widen;
-use super::simd::{Column, MatrixTimesVector, PAD};
+use super::simd::{Column, PAD, RowsTimesVector};
 
 /// Largest sum of absolute steps: times the 128 of a centroid's largest component it still fits in 32 bits.
 const MOST_IN_SUM: u64 = (1 << 24) - 1;
@@ -31,27 +31,27 @@ pub struct Rounded {
 
 impl Rounded {
     /// Rounds finite values with the smallest step that keeps all products with 8-bit centroids within 32 bits.
-    pub fn set(&mut self, values: &[f64]) {
+    pub fn new(values: &[f64]) -> Self {
         let largest = values.iter().fold(0.0f64, |most, v| most.max(v.abs()));
         let sum: f64 = values.iter().map(|v| v.abs()).sum();
         // Rounding adds at most half a step to each.
         let capacity = MOST_IN_SUM as f64 - 0.5 * values.len() as f64;
         let least = (largest / f64::from(i16::MAX)).max(sum / capacity).max(f64::MIN_POSITIVE);
-        self.step = power_of_two_from(least);
+        let step = power_of_two_from(least);
         let mut squares = 0.0;
-        self.steps.clear();
-        self.steps.extend(values.iter().map(|value| {
-            let steps = nearest(value / self.step);
-            squares += (value - f64::from(steps) * self.step).powi(2);
+        let round = |value: &f64| {
+            let steps = nearest(value / step);
+            squares += (value - f64::from(steps) * step).powi(2);
             steps as i16
-        }));
-        self.steps.resize(values.len().next_multiple_of(PAD), 0);
-        self.error = squares.sqrt();
+        };
+        let mut steps: Vec<i16> = values.iter().map(round).collect();
+        steps.resize(values.len().next_multiple_of(PAD), 0);
+        Self { step, steps, error: squares.sqrt() }
     }
 }
 
 /// A vector of a question, rounded once for all cells.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Vector {
     /// `[dim]`.
     pub exact: Vec<f64>,
@@ -60,11 +60,10 @@ pub struct Vector {
 }
 
 impl Vector {
-    pub fn set(&mut self, values: &[f32]) {
-        self.exact.clear();
-        self.exact.extend(values.iter().map(|v| f64::from(*v)));
-        self.rounded.set(&self.exact);
-        self.length = length(&self.exact);
+    pub fn new(values: &[f32]) -> Self {
+        let exact: Vec<f64> = values.iter().map(|v| f64::from(*v)).collect();
+        let length = exact.iter().map(|v| v * v).sum::<f64>().sqrt();
+        Self { rounded: Rounded::new(&exact), length, exact }
     }
 }
 
@@ -98,80 +97,71 @@ pub struct Projection {
     pub tables: Tables,
     /// Multiplier of fine residuals, in cells that have them.
     pub fine: Rounded,
-    /// The same in float64.
-    fine_components: Vec<f64>,
 }
 
 impl Projection {
-    pub fn set(&mut self, instructions: InstructionSet, shard: &ShardView<'_>, vector: &Vector) {
-        self.components.clear();
-        let m = shard.header.n_components as usize;
-        let step = f64::from(shard.header.centroid_step);
+    pub fn new(instructions: InstructionSet, shard: &ShardView<'_>, vector: &Vector) -> Self {
+        let error_per_length = up(vector.rounded.error);
         let Some(basis) = &shard.basis else {
-            self.components.extend_from_slice(&vector.exact);
-            self.rounded.clone_from(&vector.rounded);
-            (self.base, self.mean_length) = (0.0, 0.0);
-            (self.error_per_length, self.error) = (up(vector.rounded.error), 0.0);
-            return;
+            let (components, rounded) = (vector.exact.clone(), vector.rounded.clone());
+            return Self { components, rounded, error_per_length, ..Self::default() };
         };
-        self.components.resize(m, 0.0);
-        let components = &mut self.components;
-        instructions.dispatch(MatrixTimesVector {
+        let m = shard.header.n_components as usize;
+        let products = instructions.dispatch(RowsTimesVector {
             rows: basis.vectors,
             n_components: vector.exact.len(),
             vector: &vector.rounded.steps,
-            put: |at: usize, dot: i32| {
-                components[at] = f64::from(basis.steps[at]) * (vector.rounded.step * f64::from(dot));
-            },
+            which: &(0..m as u32).collect::<Vec<_>>(),
         });
+        let scaled = |(step, dot): (&f32, i32)| f64::from(*step) * (vector.rounded.step * f64::from(dot));
+        let components: Vec<f64> = basis.steps.iter().zip(products).map(scaled).collect();
         let mean = || basis.mean.iter().map(|v| f64::from(widen(*v)));
-        self.base = mean().zip(&vector.exact).map(|(a, b)| a * b).sum();
-        self.mean_length = up(mean().map(|v| v * v).sum::<f64>().sqrt());
-        self.rounded.set(&self.components);
-        self.error_per_length = up(vector.rounded.error);
-        self.error = up(self.rounded.error * step * 128.0 * (m as f64).sqrt());
+        let (rounded, step) = (Rounded::new(&components), f64::from(shard.header.centroid_step));
+        Self {
+            base: mean().zip(&vector.exact).map(|(a, b)| a * b).sum(),
+            mean_length: up(mean().map(|v| v * v).sum::<f64>().sqrt()),
+            error: up(rounded.error * step * 128.0 * (m as f64).sqrt()),
+            components,
+            rounded,
+            error_per_length,
+            ..Self::default()
+        }
     }
 
-    /// Scores a cell's centroids. `scores`: `[K]`.
-    pub(crate) fn score_centroids(
-        &self,
-        instructions: InstructionSet,
-        shard: &ShardView<'_>,
-        scores: &mut Vec<f32>,
-    ) {
-        scores.clear();
-        // Centroids without components equal the mean.
-        scores.resize(shard.header.n_centroids as usize, self.base as f32 + 0.0);
+    /// Scores a cell's centroids. Returns `[K]`.
+    pub(crate) fn score_centroids(&self, instructions: InstructionSet, shard: &ShardView<'_>) -> Vec<f32> {
         let step = f64::from(shard.header.centroid_step) * self.rounded.step;
-        instructions.dispatch(MatrixTimesVector {
+        let products = instructions.dispatch(RowsTimesVector {
             rows: shard.centroids,
             n_components: shard.header.n_components as usize,
             vector: &self.rounded.steps,
-            // Never -0, which would sort after 0 though it is equal.
-            put: |centroid: usize, dot: i32| {
-                scores[centroid] = (self.base + step * f64::from(dot)) as f32 + 0.0
-            },
+            which: &(0..shard.header.n_centroids).collect::<Vec<_>>(),
         });
+        // Never -0, which would sort after 0 though it is equal.
+        products.into_iter().map(|dot| (self.base + step * f64::from(dot)) as f32 + 0.0).collect()
     }
 
-    pub(crate) fn set_fine(&mut self, fine: &Fine<'_>) {
-        self.fine_components.clear();
-        self.fine_components
-            .extend(self.components.iter().zip(fine.steps).map(|(y, step)| y * f64::from(*step)));
-        self.fine.set(&self.fine_components);
+    /// Prepares the multipliers of the shard's residual codes and fine residuals.
+    pub(crate) fn prepare_codes(&mut self, shard: &ShardView<'_>) {
+        if let Some(residuals) = &shard.residuals {
+            self.tables = Tables::new(residuals, &self.components);
+        }
+        if let Some(fine) = shard.exact.and_then(|exact| exact.fine) {
+            let scaled = self.components.iter().zip(fine.steps).map(|(y, step)| y * f64::from(*step));
+            self.fine = Rounded::new(&scaled.collect::<Vec<f64>>());
+        }
     }
+}
 
-    pub(crate) fn set_tables(&mut self, residuals: &Residuals<'_>) {
-        let n_subspaces = residuals.subspace_starts.len() - 1;
-        let tables = &mut self.tables;
-        let mut values = [[0.0f64; CODEWORDS]; slag_common::shard::MAX_SUBSPACES];
-        let values = &mut values[..n_subspaces];
+impl Tables {
+    fn new(residuals: &Residuals<'_>, components: &[f64]) -> Self {
+        let mut values = vec![[0.0f64; CODEWORDS]; residuals.subspace_starts.len() - 1];
         let (mut offset, mut widest) = (0.0, 0.0f64);
         for (values, starts) in values.iter_mut().zip(residuals.subspace_starts.windows(2)) {
             let (start, end) = (starts[0] as usize, starts[1] as usize);
             let codewords = residuals.codewords[CODEWORDS * start..CODEWORDS * end].chunks_exact(end - start);
             for (value, codeword) in values.iter_mut().zip(codewords) {
-                let terms = codeword.iter().zip(&self.components[start..end]);
+                let terms = codeword.iter().zip(&components[start..end]);
                 *value = terms.map(|(w, y)| f64::from(widen(*w)) * y).sum();
             }
             let least = values.iter().copied().fold(f64::INFINITY, f64::min);
@@ -179,12 +169,8 @@ impl Projection {
             offset += least;
             widest = values.iter().copied().fold(widest, f64::max);
         }
-        (tables.step, tables.offset) = ((widest / 255.0) as f32, offset as f32);
-        let step = f64::from(tables.step);
-        (tables.most, tables.error) = (0, 0.0);
-        let mut error = 0.0;
-        tables.low.clear();
-        tables.high.clear();
+        let mut tables = Self { step: (widest / 255.0) as f32, offset: offset as f32, ..Self::default() };
+        let (step, mut error) = (f64::from(tables.step), 0.0);
         for (subspace, values) in values.iter().enumerate() {
             let mut column = [0; BLOCK];
             let (mut most, mut largest_rounding) = (0, 0.0f64);
@@ -201,6 +187,7 @@ impl Projection {
             half.push(column);
         }
         tables.error = up(error + (offset - f64::from(tables.offset)).abs());
+        tables
     }
 }
 
@@ -212,10 +199,6 @@ fn power_of_two_from(value: f64) -> f64 {
 /// Rounds to nearest. (Without SSE 4.1 the standard rounding is a function call.)
 fn nearest(value: f64) -> i32 {
     (value + 0.5f64.copysign(value)) as i32
-}
-
-pub fn length(vector: &[f64]) -> f64 {
-    vector.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
 pub fn up(bound: f64) -> f32 {
@@ -231,12 +214,11 @@ mod tests {
     #[test]
     fn rounded_vectors_fit_and_are_as_near_as_stated() {
         let mut random = Random::new(13);
-        let mut rounded = Rounded::default();
         for n in (1..40usize).chain([512, 8191, 8192]) {
             for (scale, is_flat) in [(1.0, false), (1.0, true), (1e-30, false), (1e6, true), (0.0, false)] {
                 let mut value = |_| if is_flat { scale } else { f64::from(random.signed()) * scale };
                 let values: Vec<f64> = (0..n).map(&mut value).collect();
-                rounded.set(&values);
+                let rounded = Rounded::new(&values);
                 assert_eq!(rounded.steps.len(), n.next_multiple_of(PAD));
                 let sum: i64 = rounded.steps.iter().map(|v| i64::from(*v).abs()).sum();
                 assert!(sum * 128 < 1 << 31, "{n} {scale} {sum}");

@@ -1,179 +1,92 @@
-//! Searches: one or several questions over a set of shards.
+//! Searches: one or several questions over a set of shards, begun by scoring all centroids.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
-use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::shard::{ScoreErrors, ShardView};
+use slag_math::simd::InstructionSet;
 
 use super::budget::{Budget, ScoreError};
-use super::cell::Cell;
-use super::centroids::{AskedQuestion, CentroidScores};
-use super::collect::{Cut, ShardGather};
-use super::matches::{Hit, Matches};
+use super::project::{Projection, Vector};
 use super::question::{Precision, Question, check};
 use super::region::Region;
-use super::select::AnswerBuffers;
 
-/// A search's budget, and buffers for the next search to reuse, so that little but answers is allocated.
-#[derive(Default)]
-pub struct Scratch {
-    budget: Budget,
-    scored: Arc<CentroidScores>,
-    buffers: Arc<Mutex<AnswerBuffers>>,
-}
-
-impl Scratch {
-    /// Sets the budget of later searches; unlimited by default.
-    pub(crate) fn set_budget(&mut self, budget: Budget) {
-        self.budget = budget;
-    }
-
-    pub fn budget(&self) -> &Budget {
-        &self.budget
-    }
-
-    /// Charges the centroids' scores to the budget.
-    fn take_scores(&self, shards: &[ShardView<'_>], questions: &[Question]) -> Result<(), ScoreError> {
-        let n_centroids: usize = shards.iter().map(|shard| shard.header.n_centroids as usize).sum();
-        let n_vectors: usize = questions.iter().map(|question| question.vectors().count()).sum();
-        self.budget.take(n_centroids * n_vectors * size_of::<f32>());
-        Ok(self.budget.check()?)
-    }
-
-    /// Returns unshared buffers: those of the last search if it is over, else new ones.
-    fn take(&mut self) -> &mut CentroidScores {
-        if Arc::get_mut(&mut self.scored).is_none() {
-            *self = Self { budget: std::mem::take(&mut self.budget), ..Self::default() };
-        }
-        Arc::get_mut(&mut self.scored).unwrap_or_else(|| unreachable!("the only owner"))
-    }
-
-    fn search<'a>(&self, asked: AskedQuestion<'a>) -> Search<'a> {
-        Search { asked, buffers: Arc::clone(&self.buffers) }
-    }
-
-    #[cfg(test)]
-    pub(crate) fn is_untouched(&self) -> bool {
-        self.scored.shards.is_empty()
-    }
-}
-
-/// One question's centroid scores over a set of shards, reusable for several kinds of answers.
+/// One question's centroid scores over a set of shards, for several kinds of answers.
 pub struct Search<'a> {
-    pub(super) asked: AskedQuestion<'a>,
-    /// Shared by the searches of a batch.
-    buffers: Arc<Mutex<AnswerBuffers>>,
+    /// All shards; runs and hits refer to them by index.
+    pub shards: &'a [ShardView<'a>],
+    pub(super) question: &'a Question,
+    pub(super) region: Region,
+    pub(super) precision: Precision,
+    /// By shard; absent for those outside the region.
+    pub(super) scored: Arc<[Option<ShardScores>]>,
+    pub(super) budget: Budget,
+    /// Indices of its vectors among those scored: its own, then its negatives.
+    pub(super) places: Vec<usize>,
+    /// Its index among the questions scored.
+    pub(super) index: usize,
+    /// See [`Question::steepness`].
+    pub(super) steepness: f32,
+}
+
+pub(super) struct ShardScores {
+    pub projections: Vec<Projection>,
+    /// `[vectors][centroids]`.
+    pub centroids: Vec<Vec<f32>>,
+    /// `[questions][centroids]`: scores minus those of the negatives.
+    pub combined: Vec<Vec<f32>>,
 }
 
 impl<'a> Search<'a> {
-    /// [`Search::batch`] for one question.
+    /// [`Search::batch`] for one question, without a budget.
     pub fn new(
         shards: &'a [ShardView<'a>],
         question: &'a Question,
         region: Region,
         precision: Precision,
     ) -> Result<Self, ScoreError> {
-        Self::reusing(&mut Scratch::default(), shards, question, region, precision)
-    }
-
-    /// As [`Search::new`], in the buffers of an earlier search if that is over.
-    pub fn reusing(
-        scratch: &mut Scratch,
-        shards: &'a [ShardView<'a>],
-        question: &'a Question,
-        region: Region,
-        precision: Precision,
-    ) -> Result<Self, ScoreError> {
-        let mut searches = Self::batch(scratch, shards, std::slice::from_ref(question), region, precision)?;
-        Ok(searches.swap_remove(0))
+        let questions = std::slice::from_ref(question);
+        Ok(Self::batch(shards, questions, &region, precision, &Budget::default())?.swap_remove(0))
     }
 
     /// Scores the centroids for several questions in one pass; returns a search for each, in their order.
     ///
     /// Costs one product per centroid, component and distinct vector (shared negatives are multiplied once), in
-    /// parallel by shard. Reuses the buffers of earlier searches if those are over.
+    /// parallel by shard.
     pub fn batch(
-        scratch: &mut Scratch,
         shards: &'a [ShardView<'a>],
         questions: &'a [Question],
-        region: Region,
+        region: &Region,
         precision: Precision,
+        budget: &Budget,
     ) -> Result<Vec<Self>, ScoreError> {
         check(shards, questions)?;
-        scratch.take_scores(shards, questions)?;
-        let places = scratch.take().score(shards, questions, region.clone(), precision);
-        let searches = questions.iter().zip(places).enumerate().map(|(index, (question, places))| {
-            scratch.search(AskedQuestion {
-                shards,
-                question,
-                region: region.clone(),
-                precision,
-                scored: Arc::clone(&scratch.scored),
-                budget: scratch.budget.clone(),
-                places,
-                index,
-                steepness: question.steepness(),
-            })
+        let n_centroids: usize = shards.iter().map(|shard| shard.header.n_centroids as usize).sum();
+        let n_vectors: usize = questions.iter().map(|question| question.vectors().count()).sum();
+        budget.take(n_centroids * n_vectors * size_of::<f32>());
+        budget.check()?;
+        let (vectors, places) = distinct(questions);
+        let score = |shard: &ShardView<'_>| {
+            let is_searched = region.touches(&shard.position_box());
+            is_searched.then(|| ShardScores::new(shard, &vectors, &places, precision))
+        };
+        let scored: Arc<[_]> = shards.par_iter().map(score).collect::<Vec<_>>().into();
+        let searches = questions.iter().zip(places).enumerate().map(|(index, (question, places))| Self {
+            shards,
+            question,
+            region: region.clone(),
+            precision,
+            scored: Arc::clone(&scored),
+            budget: budget.clone(),
+            places,
+            index,
+            steepness: question.steepness(),
         });
         Ok(searches.collect())
     }
 
-    /// Returns the Gaussians with scores at or above a threshold, as far as the shards' data decide.
-    pub fn matching(&self, threshold: f32) -> Matches {
-        let mut all = Matches::default();
-        let mut buffers = self.take_buffers();
-        let gather = &mut buffers.gather;
-        self.asked.collect(gather, Cut { score: threshold, least: threshold }, false);
-        all.runs.reserve(gather.shards.iter().map(|of_shard| of_shard.found.runs.len()).sum());
-        for ShardGather { found, .. } in &gather.shards {
-            all.runs.extend_from_slice(&found.runs);
-            all.n_gaussians += found.n_gaussians;
-            all.n_centroids_undecided += found.n_centroids_undecided;
-            all.effort += found.effort;
-            all.n_shards_below += found.n_shards_below;
-        }
-        self.put_back(buffers);
-        all
-    }
-
-    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from `near`,
-    /// then by cell and index. The selection is exact with respect to the scores returned.
-    pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
-        let mut buffers = self.take_buffers();
-        let hits = self.asked.best(&mut buffers, limit, threshold, near);
-        self.put_back(buffers);
-        hits
-    }
-
-    /// Takes the shared buffers, or empty ones while another search of the batch uses them. (A lock held over
-    /// parallel work would block the thread that the other search is scheduled on.)
-    fn take_buffers(&self) -> AnswerBuffers {
-        std::mem::take(&mut *self.buffers.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-
-    fn put_back(&self, buffers: AnswerBuffers) {
-        *self.buffers.lock().unwrap_or_else(PoisonError::into_inner) = buffers;
-    }
-
-    /// Returns all shards; runs and hits refer to them by index.
-    pub fn shards(&self) -> &'a [ShardView<'a>] {
-        self.asked.shards
-    }
-
     pub fn searched(&self) -> impl Iterator<Item = &'a ShardView<'a>> {
-        let searched =
-            self.asked.shards.iter().zip(&self.asked.scored.shards).filter(|(_, scores)| scores.is_searched);
-        searched.map(|(shard, _)| shard)
-    }
-
-    /// Bounds every score's difference from the score of any embedding that the centroid or Gaussian represents.
-    pub fn score_error_bound(&self) -> f32 {
-        let cells = (0..self.asked.shards.len()).into_par_iter().filter_map(|at| self.asked.cell(at));
-        let of_cell = |cell: Cell<'_>| {
-            (0..cell.centroids.len()).map(|centroid| cell.score_error(centroid)).fold(0.0, f32::max)
-        };
-        cells.map(of_cell).reduce(|| 0.0, f32::max)
+        self.shards.iter().zip(&*self.scored).filter_map(|(shard, scores)| scores.as_ref().map(|_| shard))
     }
 
     /// Returns the score errors measured over a bank of texts, each the maximum over the shards searched, so that the
@@ -181,7 +94,7 @@ impl<'a> Search<'a> {
     pub(crate) fn measured_errors(&self) -> Option<ScoreErrors> {
         let mut largest: Option<ScoreErrors> = None;
         for shard in self.searched() {
-            let of_codes = match self.asked.precision {
+            let of_codes = match self.precision {
                 Precision::Centroids => shard.residuals.is_none() && shard.exact.is_none(),
                 Precision::Measured => true,
                 Precision::Exact => shard.exact.is_none(),
@@ -203,6 +116,50 @@ impl<'a> Search<'a> {
 
     /// Returns whether membership is exact: exact embeddings are asked for and present in every shard searched.
     pub fn is_exact(&self) -> bool {
-        self.asked.precision == Precision::Exact && self.searched().all(|shard| shard.exact.is_some())
+        self.precision == Precision::Exact && self.searched().all(|shard| shard.exact.is_some())
     }
+}
+
+/// Returns the distinct vectors of some questions, and the indices of each question's vectors, its own first.
+pub(super) fn distinct(questions: &[Question]) -> (Vec<Vector>, Vec<Vec<usize>>) {
+    let mut distinct: Vec<&[f32]> = Vec::new();
+    let mut place = |vector| {
+        distinct.iter().position(|known| *known == vector).unwrap_or_else(|| {
+            distinct.push(vector);
+            distinct.len() - 1
+        })
+    };
+    let places = questions.iter().map(|question| question.vectors().map(&mut place).collect()).collect();
+    (distinct.into_iter().map(Vector::new).collect(), places)
+}
+
+impl ShardScores {
+    fn new(shard: &ShardView<'_>, vectors: &[Vector], places: &[Vec<usize>], precision: Precision) -> Self {
+        let instructions = InstructionSet::widest();
+        let are_codes_read = match precision {
+            Precision::Centroids => false,
+            Precision::Measured => true,
+            Precision::Exact => shard.exact.is_none(),
+        };
+        let project = |vector: &Vector| {
+            let mut projection = Projection::new(instructions, shard, vector);
+            if are_codes_read {
+                projection.prepare_codes(shard);
+            }
+            projection
+        };
+        let projections: Vec<Projection> = vectors.iter().map(project).collect();
+        let centroids: Vec<Vec<f32>> =
+            projections.iter().map(|of| of.score_centroids(instructions, shard)).collect();
+        let combined = places.iter().map(|places| {
+            let own = centroids[places[0]].iter().enumerate();
+            own.map(|(at, own)| combine(*own, places[1..].iter().map(|n| centroids[*n][at]))).collect()
+        });
+        Self { combined: combined.collect(), projections, centroids }
+    }
+}
+
+/// Returns a product minus the largest of its negatives' products. Never -0, which would sort after 0.
+pub(super) fn combine(own: f32, negatives: impl Iterator<Item = f32>) -> f32 {
+    negatives.reduce(f32::max).map_or(own, |worst| own - worst) + 0.0
 }

@@ -4,97 +4,86 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::cell::Cell;
-use super::centroids::AskedQuestion;
 use super::collect::{BINS, Cut, Gather, bin_of, edge_of, runs_inside};
 use super::matches::{Hit, Run};
+use super::search::Search;
 
-#[derive(Default)]
-pub(super) struct AnswerBuffers {
-    pub gather: Gather,
-    order: Order,
-}
-
-#[derive(Default)]
-struct Order {
-    parts: Vec<Part>,
-    runs: Vec<Run>,
-    keys: Vec<u64>,
-    tied: Vec<(f64, Hit)>,
-}
-
-/// Counters of one counting thread.
-#[derive(Default)]
-struct Part {
-    bins: Vec<u64>,
-    in_bin: Vec<(f32, u64)>,
-}
-
-impl AskedQuestion<'_> {
-    pub(super) fn best(
-        &self,
-        buffers: &mut AnswerBuffers,
-        limit: usize,
-        threshold: f32,
-        near: Option<DVec3>,
-    ) -> Vec<Hit> {
-        let mut hits = Vec::new();
+impl Search<'_> {
+    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from `near`,
+    /// then by cell and index. The selection is exact with respect to the scores returned.
+    pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
         if limit == 0 {
-            return hits;
+            return Vec::new();
         }
-        let AnswerBuffers { gather, order } = buffers;
         let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
         let cut = if has_detail {
             // Half as many again: members ranking last by their own scores are then not among the best.
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
-            let floor = self.centroid_score_at(order, enough, f32::NEG_INFINITY);
-            self.count(gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
-            score_reached(gather, limit).map(|score| score.max(threshold))
+            let floor = self.centroid_score_at(enough, f32::NEG_INFINITY);
+            let counted = self.count(threshold, floor.unwrap_or(f32::NEG_INFINITY));
+            score_reached(&counted, limit).map(|score| score.max(threshold))
         } else {
-            self.centroid_score_at(order, limit, threshold)
+            self.centroid_score_at(limit, threshold)
         };
-        self.collect(gather, Cut { score: cut.unwrap_or(threshold), least: threshold }, true);
-        self.rank(gather, order, limit, near, &mut hits);
-        hits
+        let found = self.collect(Cut { score: cut.unwrap_or(threshold), least: threshold }, true);
+        self.rank(&found, limit, near)
     }
 
     /// Returns the highest centroid score such that centroids at or above it have `limit` members or more; `None` if
-    /// too few centroids reach the threshold.
-    fn centroid_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
-        let cells: Vec<Option<Cell<'_>>> = (0..self.shards.len()).map(|at| self.cell(at)).collect();
-        let scores = |at: usize| {
-            let centroids = cells[at].as_ref().map_or(&[][..], |cell| cell.centroids);
-            centroids.iter().copied().zip(0..).filter(move |(score, _)| *score >= threshold)
+    /// too few centroids reach the threshold. Sorts only the centroids of the rank's bin, found by a histogram.
+    fn centroid_score_at(&self, limit: usize, threshold: f32) -> Option<f32> {
+        let cells: Vec<Cell<'_>> = (0..self.shards.len()).filter_map(|at| self.cell(at)).collect();
+        let scores = |cell: &Cell<'_>| {
+            let scores = cell.centroids.iter().copied().zip(0usize..);
+            scores.filter(|(score, _)| *score >= threshold).collect::<Vec<_>>()
         };
-        let count = |at: usize, centroid: usize| {
-            let shard = &self.shards[at];
+        let count = |Cell { shard, filter, .. }: &Cell<'_>, centroid: usize| {
             let members =
                 shard.centroid_starts[centroid] as usize..shard.centroid_starts[centroid + 1] as usize;
-            match cells[at].as_ref().and_then(|cell| cell.filter.as_ref()) {
+            match filter {
                 None => members.len() as u64,
-                filter => runs_inside(shard, filter, members).map(|inside| inside.len() as u64).sum(),
+                filter => runs_inside(shard, filter.as_ref(), members).map(|of| of.len() as u64).sum(),
             }
         };
-        order.score_at(limit, self.shards.len(), scores, count)
+        let empty = || vec![0u64; BINS];
+        let cells_at_a_time = cells.len().div_ceil(rayon::current_num_threads());
+        let histogram = cells.par_iter().with_min_len(cells_at_a_time).fold(empty, |mut bins, cell| {
+            scores(cell).into_iter().for_each(|(score, at)| bins[bin_of(score)] += count(cell, at));
+            bins
+        });
+        let histogram = histogram.reduce(empty, |mut all, bins| {
+            all.iter_mut().zip(bins).for_each(|(all, n)| *all += n);
+            all
+        });
+        let mut n_better = 0;
+        let bin = (0..BINS).rev().find(|bin| {
+            let is_here = n_better + histogram[*bin] >= limit as u64;
+            n_better += if is_here { 0 } else { histogram[*bin] };
+            is_here
+        })?;
+        let of_bin = cells.par_iter().flat_map_iter(|cell| {
+            let here = scores(cell).into_iter().filter(|(score, _)| bin_of(*score) == bin);
+            here.map(|(score, at)| (score, count(cell, at)))
+        });
+        let mut of_bin: Vec<(f32, u64)> = of_bin.collect();
+        of_bin.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
+        let reached = of_bin.iter().find(|(_, count)| {
+            n_better += count;
+            n_better >= limit as u64
+        });
+        reached.map(|(score, _)| *score)
     }
 
-    fn rank(
-        &self,
-        gather: &Gather,
-        order: &mut Order,
-        limit: usize,
-        near: Option<DVec3>,
-        hits: &mut Vec<Hit>,
-    ) {
-        let Order { runs, keys, tied, .. } = order;
+    fn rank(&self, found: &[Gather], limit: usize, near: Option<DVec3>) -> Vec<Hit> {
         let mut by_cell: Vec<usize> = (0..self.shards.len()).collect();
         by_cell.sort_by_key(|at| self.shards[*at].header.cell_id);
-        runs.clear();
-        by_cell.iter().for_each(|at| runs.extend_from_slice(&gather.shards[*at].found.runs));
-        keys.clear();
+        let runs: Vec<Run> = by_cell.iter().flat_map(|at| &found[*at].found.runs).copied().collect();
         // Equal scores keep the order of the runs, which is that of cells and indices.
-        keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
+        let key = |(run, place): (&Run, u64)| u64::from(!rising(run.score)) << 32 | place;
+        let mut keys: Vec<u64> = runs.iter().zip(0..).map(key).collect();
         // All keys differ.
         keys.par_sort_unstable();
+        let mut hits: Vec<Hit> = Vec::new();
         for ties in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
             let first = hits.len();
             for key in ties {
@@ -105,8 +94,8 @@ impl AskedQuestion<'_> {
                 hits.extend((start..end).map(|index| Hit { shard, index, score }));
             }
             if let Some(near) = near {
-                tied.clear();
-                tied.extend(hits.drain(first..).map(|hit| (self.distance(near, &hit), hit)));
+                let mut tied: Vec<(f64, Hit)> =
+                    hits.drain(first..).map(|hit| (self.distance(near, &hit), hit)).collect();
                 // Stable sort: equally near hits stay in the order of cell and index.
                 tied.sort_by(|a, b| a.0.total_cmp(&b.0));
                 hits.extend(tied.iter().map(|(_, hit)| *hit).take(limit - first));
@@ -115,6 +104,7 @@ impl AskedQuestion<'_> {
                 break;
             }
         }
+        hits
     }
 
     fn distance(&self, from: DVec3, hit: &Hit) -> f64 {
@@ -122,59 +112,11 @@ impl AskedQuestion<'_> {
     }
 }
 
-impl Order {
-    /// Returns the score of the Gaussian at a rank, counted from 1 for the best; `None` if there are fewer.
-    ///
-    /// `scores`: by place, of `n_places`; `count`: the number of Gaussians with each. Sorts only the rank's bin,
-    /// found by a histogram.
-    fn score_at<I: Iterator<Item = (f32, usize)>>(
-        &mut self,
-        rank: usize,
-        n_places: usize,
-        scores: impl Fn(usize) -> I + Sync,
-        count: impl Fn(usize, usize) -> u64 + Sync,
-    ) -> Option<f32> {
-        let n_parts = rayon::current_num_threads().min(n_places).max(1);
-        self.parts.resize_with(n_parts, Part::default);
-        let places = |part: usize| n_places * part / n_parts..n_places * (part + 1) / n_parts;
-        self.parts.par_iter_mut().enumerate().for_each(|(part, Part { bins, .. })| {
-            bins.clear();
-            bins.resize(BINS, 0);
-            for place in places(part) {
-                scores(place).for_each(|(score, at)| bins[bin_of(score)] += count(place, at));
-            }
-        });
-        let mut n_better = 0;
-        let bin = (0..BINS).rev().find(|bin| {
-            let n: u64 = self.parts.iter().map(|part| part.bins[*bin]).sum();
-            let is_here = n_better + n >= rank as u64;
-            n_better += if is_here { 0 } else { n };
-            is_here
-        })?;
-        self.parts.par_iter_mut().enumerate().for_each(|(part, Part { in_bin, .. })| {
-            in_bin.clear();
-            for place in places(part) {
-                let of_bin = scores(place).filter(|(score, _)| bin_of(*score) == bin);
-                in_bin.extend(of_bin.map(|(score, at)| (score, count(place, at))));
-            }
-        });
-        let (first, others) = self.parts.split_first_mut()?;
-        others.iter().for_each(|part| first.in_bin.extend_from_slice(&part.in_bin));
-        first.in_bin.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
-        let reached = first.in_bin.iter().find(|(_, count)| {
-            n_better += count;
-            n_better >= rank as u64
-        });
-        reached.map(|(score, _)| *score)
-    }
-}
-
 /// Returns a score that at least `limit` of the counted Gaussians reach; `None` if there are fewer.
-fn score_reached(gather: &Gather, limit: usize) -> Option<f32> {
-    let bins: Vec<&[u32]> = gather.shards.iter().map(|of_shard| &of_shard.bins[..]).collect();
+fn score_reached(counted: &[Gather], limit: usize) -> Option<f32> {
     let mut n = 0;
     let bin = (0..BINS).rev().find(|bin| {
-        n += bins.iter().filter_map(|bins| bins.get(*bin)).map(|n| u64::from(*n)).sum::<u64>();
+        n += counted.iter().filter_map(|of| of.bins.get(*bin)).map(|n| u64::from(*n)).sum::<u64>();
         n >= limit as u64
     })?;
     Some(edge_of(bin))

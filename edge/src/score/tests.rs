@@ -127,7 +127,7 @@ proptest! {
         let views = views(&built);
         let threshold = threshold as f32 / 8.0;
         let precision = if centroids_only { Precision::Centroids } else { Precision::Exact };
-        let batch = Search::batch(&mut Scratch::default(), &views, &questions, region.clone(), precision).expect("valid");
+        let batch = Search::batch(&views, &questions, &region, precision, &Budget::default()).expect("valid");
         prop_assert_eq!(batch.len(), questions.len());
         for (search, question) in batch.iter().zip(&questions) {
             // Centroids are rounded with a power-of-two step, so sums stay exact.
@@ -239,6 +239,10 @@ pub(super) fn random_question(random: &mut Random, dim: usize, n_negatives: usiz
     Question { vector: unit(), negatives: (0..n_negatives).map(|_| unit()).collect() }
 }
 
+fn batch<'a>(shards: &'a [ShardView<'a>], questions: &'a [Question]) -> Result<Vec<Search<'a>>, ScoreError> {
+    Search::batch(shards, questions, &Region::default(), Precision::Exact, &Budget::default())
+}
+
 #[test]
 fn does_not_depend_on_threads() {
     let mut random = Random::new(2);
@@ -248,14 +252,7 @@ fn does_not_depend_on_threads() {
     let answers = [1, 2, 7].map(|threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
-            let batch = Search::batch(
-                &mut Scratch::default(),
-                &views,
-                &questions,
-                Region::default(),
-                Precision::Exact,
-            )
-            .expect("valid");
+            let batch = batch(&views, &questions).expect("valid");
             let answer =
                 |search: &Search<'_>| (search.matching(-0.05), search.best(40, -1.0, Some(DVec3::ONE)));
             batch.iter().map(answer).collect::<Vec<_>>()
@@ -295,9 +292,7 @@ fn refuses_what_cannot_be_scored() {
         let negatives = negatives.iter().map(|n| Arc::from(*n)).collect();
         let questions = [Question::new([1.0, 0.0]), Question { vector: query.into(), negatives }];
         let shards = [shard.view()];
-        let batch =
-            Search::batch(&mut Scratch::default(), &shards, &questions, Region::default(), Precision::Exact);
-        let batch = batch.map(|_| ()).err();
+        let batch = batch(&shards, &questions).map(|_| ()).err();
         let alone = Search::new(&shards, &questions[1], Region::default(), Precision::Exact);
         assert_eq!(format!("{:?}", alone.map(|_| ()).err()), format!("{batch:?}"));
         batch

@@ -143,10 +143,8 @@ impl EdgeCache {
 
     pub fn read_manifest(&self, hash: Hash32) -> Result<Manifest, StoreError> {
         let path = self.manifest_path(hash);
-        let bytes = match self.files.read(&path, manifest::MAX_BYTES) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
-            other => other?,
-        };
+        let missing = StoreError::missing(&path);
+        let bytes = self.files.read(&path, manifest::MAX_BYTES).map_err(missing)?;
         let found = Hash32::of(&bytes);
         if found != hash {
             return Err(StoreError::Hash { path, expected: hash, found });

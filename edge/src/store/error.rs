@@ -1,7 +1,7 @@
 //! Errors of the cache.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use slag_common::Hash32;
 use slag_common::container::ContainerError;
@@ -45,6 +45,14 @@ impl From<io::Error> for StoreError {
 }
 
 impl StoreError {
+    /// Returns the error for what reading a file that must be there gave.
+    pub(super) fn missing(path: &Path) -> impl Fn(io::Error) -> Self {
+        move |e| match e.kind() {
+            io::ErrorKind::NotFound => Self::Missing { path: path.to_owned() },
+            _ => e.into(),
+        }
+    }
+
     pub(crate) fn is_damage(&self) -> bool {
         use StoreError::{Hash, Mismatch, Shard, Unreadable};
         matches!(self, Shard { .. } | Mismatch { .. } | Hash { .. } | Unreadable(_))

@@ -1,6 +1,5 @@
 //! A shard on board: mapped, and checked against the manifest.
 
-use std::io;
 use std::path::Path;
 
 use slag_common::Hash32;
@@ -68,11 +67,8 @@ impl OpenShard {
         let path = cache.shard_path(at.hash);
         let stat = cache.files().stat(&path)?;
         let (cell, layout) = check_file(cache, &path, at, profile, manifest)?;
-        let bytes = match cache.files().map(&path) {
-            // A fetch may remove it in between.
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
-            other => other?,
-        };
+        // A fetch may remove it in between.
+        let bytes = cache.files().map(&path).map_err(StoreError::missing(&path))?;
         if bytes.len() as u64 != at.len_bytes {
             return Err(StoreError::Missing { path });
         }
@@ -88,12 +84,7 @@ pub fn check_file<'a>(
     profile: Profile,
     manifest: &'a Manifest,
 ) -> Result<(&'a CellRecord, ShardLayout), StoreError> {
-    let bytes = match cache.files().read(path, at.len_bytes) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => {
-            return Err(StoreError::Missing { path: path.to_owned() });
-        }
-        other => other?,
-    };
+    let bytes = cache.files().read(path, at.len_bytes).map_err(StoreError::missing(path))?;
     check_shard(path, &bytes, at, profile, manifest)
 }
 

@@ -11,6 +11,7 @@ use slag_common::Hash32;
 use slag_common::container::{self, Layout};
 
 use super::cache::EdgeCache;
+use super::files::put_through;
 
 /// A longer file is ignored: 4,096 words with 2,048 components take less.
 const MAX_BYTES: u64 = 64 << 20;
@@ -61,11 +62,7 @@ pub fn write(
     for old in files.list(dir)? {
         files.remove(&dir.join(old))?;
     }
-    let part = path.with_extension("part");
-    files.write_from(&part, 0, &bytes)?;
-    files.sync(&part)?;
-    files.rename(&part, &path)?;
-    files.sync_dir(dir)
+    put_through(files, &path.with_extension("part"), &bytes, &path)
 }
 
 #[cfg(test)]

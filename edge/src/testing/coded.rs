@@ -78,41 +78,35 @@ impl CodedShard {
             |n: usize, scale: f32| -> Vec<f32> { (0..n).map(|_| random.signed() * scale).collect() };
         let (centroids, centroid_step) = quantise(&floats(k * m, 1.5 / (m as f32).sqrt()));
         let (vectors, basis_step) = quantise(&floats(m * dim, 1.2 / (dim as f32).sqrt()));
-        let steps = floats(m, 0.5).iter().map(|v| basis_step * (1.0 + v)).collect();
-        let mean = floats(dim, 0.5 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
+        let halves = |values: Vec<f32>| values.into_iter().map(f16::from_f32).collect();
         // The last component has no codeword if possible.
         let n_coded = if m > self.n_subspaces { m - 1 } else { m };
-        let subspace_starts =
-            (0..=self.n_subspaces).map(|g| (n_coded * g / self.n_subspaces.max(1)) as u32).collect();
         let n_codewords = CODEWORDS * if self.n_subspaces == 0 { 0 } else { n_coded };
-        let codewords = floats(n_codewords, 0.5 / (m as f32).sqrt()).into_iter().map(f16::from_f32).collect();
-        let residual_scales = floats(k, 1.0).into_iter().map(|v| v.abs()).collect();
-        let codes =
-            (0..n.div_ceil(BLOCK) * BLOCK * self.n_subspaces / 2).map(|_| random.bits() as u8).collect();
-        let positions = (0..n).map(|_| [(); 3].map(|()| random.bits() as u16)).collect();
         let bounds = Aabb { min: self.origin, max: self.origin + 10.0 };
-        let header = ShardHeader {
-            n_components: m as u32,
-            n_subspaces: self.n_subspaces as u32,
-            centroid_step,
-            errors: ScoreErrors { mean: CODE_ERROR, ..ScoreErrors::default() },
-            ..sample::header(self.cell_id, n, k, dim, bounds)
-        };
-        let (radii, reaches) = (vec![0.0; k], vec![0.0; k]);
         Columns {
-            header,
-            positions,
+            header: ShardHeader {
+                n_components: m as u32,
+                n_subspaces: self.n_subspaces as u32,
+                centroid_step,
+                errors: ScoreErrors { mean: CODE_ERROR, ..ScoreErrors::default() },
+                ..sample::header(self.cell_id, n, k, dim, bounds)
+            },
             centroid_starts,
             centroids,
-            mean,
             vectors,
-            steps,
-            subspace_starts,
-            codewords,
-            residual_scales,
-            codes,
-            radii,
-            reaches,
+            steps: floats(m, 0.5).iter().map(|v| basis_step * (1.0 + v)).collect(),
+            mean: halves(floats(dim, 0.5 / (dim as f32).sqrt())),
+            subspace_starts: (0..=self.n_subspaces)
+                .map(|g| (n_coded * g / self.n_subspaces.max(1)) as u32)
+                .collect(),
+            codewords: halves(floats(n_codewords, 0.5 / (m as f32).sqrt())),
+            residual_scales: floats(k, 1.0).into_iter().map(f32::abs).collect(),
+            codes: (0..n.div_ceil(BLOCK) * BLOCK * self.n_subspaces / 2)
+                .map(|_| random.bits() as u8)
+                .collect(),
+            positions: (0..n).map(|_| [(); 3].map(|()| random.bits() as u16)).collect(),
+            radii: vec![0.0; k],
+            reaches: vec![0.0; k],
         }
     }
 

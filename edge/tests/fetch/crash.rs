@@ -157,10 +157,7 @@ fn a_full_disk_leaves_the_old_generation() {
     for is_known in [true, false] {
         for free_bytes in (0..).step_by(400) {
             let files = Arc::new(trial.before.fork(None, 0));
-            match is_known {
-                true => files.limit(Some(used_bytes + free_bytes)),
-                false => files.limit_unseen(used_bytes + free_bytes),
-            }
+            files.limit(Some(used_bytes + free_bytes), is_known);
             let (robot, result) = trial.fetch(&files, 2);
             let staged: Vec<String> = robot.staged().into_iter().filter(|name| name != "put0").collect();
             match result {
@@ -177,7 +174,7 @@ fn a_full_disk_leaves_the_old_generation() {
                 Err(e) => panic!("space for {free_bytes}: {e}"),
             }
             assert_holds(&robot.snapshot(), &trial.old, 0..3);
-            files.limit(None);
+            files.limit(None, true);
             let report = trial.fetch(&files, 2).1.expect("there is space again");
             assert_eq!(report.resumed_bytes > 0, !staged.is_empty(), "what arrived is kept: {staged:?}");
             n_resumed += u64::from(report.resumed_bytes > 0);

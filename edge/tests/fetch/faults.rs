@@ -68,10 +68,9 @@ fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     engine.reload().map_err(|e| slag_edge::error_line(&e))?;
     let request =
         QueryRequest { kind: Some(AnswerKind::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };
-    let reply = engine
-        .answer(request, &slag_edge::score::Budget::default())
-        .map_err(|e| slag_edge::error_line(&e))?;
-    let answers = reply.answers().next().expect("of one text");
+    let on_board = engine.on_board().map_err(|e| e.to_string())?;
+    let reply = on_board.answer(request, &slag_edge::score::Budget::default()).map_err(|e| e.to_string())?;
+    let answers = reply.answers.first().expect("of one text");
     let found = reply.gaussians(answers).iter().map(|g| place(g.position_in_world.into())).collect();
     Ok((answers.generation, found))
 }
@@ -207,11 +206,8 @@ impl Stage {
         let (storage, step) = (random.below(4), 1 + random.below(55));
         let files = Arc::new(self.before.fork((storage == 1).then_some(step), seed));
         files.fail_at((storage == 2).then_some(step));
-        match (storage, self.before.used_bytes() + random.below(8000)) {
-            (3, capacity_bytes) if seed.is_multiple_of(2) => files.limit(Some(capacity_bytes)),
-            (3, capacity_bytes) => files.limit_unseen(capacity_bytes),
-            _ => {}
-        }
+        let capacity_bytes = self.before.used_bytes() + random.below(8000);
+        files.limit((storage == 3).then_some(capacity_bytes), seed.is_multiple_of(2));
         let mut robot = self.robot(&files);
         if seed % 8 == 5 {
             files.flip(&robot.cache.dir().join("usage.json"), &mut random);
@@ -228,7 +224,7 @@ impl Stage {
             0 if storage != 1 => Arc::new(files.fork(None, seed)),
             _ => Arc::new(files.after_power_cut(seed)),
         };
-        files.limit(None);
+        files.limit(None, true);
         files.fail_at(None);
         let robot = self.robot(&files);
         rot_one_copy(&files, robot.cache.dir(), seed);

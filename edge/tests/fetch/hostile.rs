@@ -143,22 +143,17 @@ fn signed_nonsense_is_refused() {
     assert!(matches!(error, FetchError::Plan(PlanError::Conflict { .. })), "{error}");
 
     // An object that is not a shard; an empty one; one longer than any disk.
-    let mut junk = scene.clone();
-    let hash = Hash32::of(b"junk");
-    junk.objects.insert(hash, b"junk".to_vec());
-    let junk = junk.edited(|manifest| {
-        let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
-        (record.hash, record.len_bytes) = (hash, 4);
-    });
-    without_a_cell(junk, 0);
-    let nothing = scene.clone().edited(|manifest| {
-        let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
-        (record.hash, record.len_bytes) = (Hash32::of(b""), 0);
-    });
-    without_a_cell(nothing, 0);
-    let error = fetched(scene.clone().edited(|manifest| {
-        manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there").len_bytes = u64::MAX;
-    }));
+    let listing = |mut published: Published, bytes: &[u8], len_bytes: u64| {
+        let hash = Hash32::of(bytes);
+        published.objects.insert(hash, bytes.to_vec());
+        published.edited(|manifest| {
+            let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
+            (record.hash, record.len_bytes) = (hash, len_bytes);
+        })
+    };
+    without_a_cell(listing(scene.clone(), b"junk", 4), 0);
+    without_a_cell(listing(scene.clone(), b"", 0), 0);
+    let error = fetched(listing(scene.clone(), b"long", u64::MAX));
     assert!(matches!(error, FetchError::NoSpace { needed_bytes: u64::MAX, .. }), "{error}");
 
     // Kept shards are checked against the new manifest too.
@@ -175,17 +170,9 @@ fn signed_nonsense_is_refused() {
 #[test]
 fn addresses_that_are_none_are_refused() {
     let dir = tempfile::tempdir().expect("temporary folder");
-    for from in [
-        "",
-        "store",
-        "/etc/passwd",
-        "file:///etc/passwd",
-        "ftp://host",
-        "http://",
-        "http://a@b",
-        "http://a/?q=1",
-        "http://a/#f",
-    ] {
+    let none =
+        " store /etc/passwd file:///etc/passwd ftp://host http:// http://a@b http://a/?q=1 http://a/#f";
+    for from in none.split(' ') {
         let error = Robot::on_disk(dir.path(), from).fetch().expect_err("refused");
         assert!(matches!(error, FetchError::Address { .. }), "{from}: {error}");
     }

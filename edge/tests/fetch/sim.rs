@@ -20,25 +20,14 @@ struct Inode {
     durable: Vec<u8>,
 }
 
-/// An unsynced change of a folder.
+/// An unsynced change of a folder: a link, or a removal.
 #[derive(Clone)]
-enum Change {
-    Link {
-        path: PathBuf,
-        inode: usize,
-    },
-    /// `after`: the link of the same rename; renaming never loses a file.
-    Unlink {
-        path: PathBuf,
-        after: Option<usize>,
-    },
-}
-
-impl Change {
-    fn dir(&self) -> Option<&Path> {
-        let (Self::Link { path, .. } | Self::Unlink { path, .. }) = self;
-        path.parent()
-    }
+struct Change {
+    path: PathBuf,
+    /// Absent: the path is removed.
+    inode: Option<usize>,
+    /// The link of the same rename; renaming never loses a file.
+    after: Option<usize>,
 }
 
 #[derive(Clone, Default)]
@@ -78,15 +67,10 @@ impl SimFiles {
         self.0.lock().expect("sound").n_steps
     }
 
-    pub fn limit(&self, capacity_bytes: Option<u64>) {
+    /// Limits the bytes of all files. Without showing it: other programs use the space up meanwhile.
+    pub fn limit(&self, capacity_bytes: Option<u64>, is_shown: bool) {
         let mut state = self.0.lock().expect("sound");
-        (state.capacity_bytes, state.hides_free_space) = (capacity_bytes, false);
-    }
-
-    /// Limits the bytes of all files without showing it: other programs use the space up meanwhile.
-    pub fn limit_unseen(&self, capacity_bytes: u64) {
-        let mut state = self.0.lock().expect("sound");
-        (state.capacity_bytes, state.hides_free_space) = (Some(capacity_bytes), true);
+        (state.capacity_bytes, state.hides_free_space) = (capacity_bytes, !is_shown);
     }
 
     /// Flips a bit of a file, if it exists: the medium rots.
@@ -111,12 +95,8 @@ impl SimFiles {
         let mut kept_changes = BTreeSet::new();
         let pending = std::mem::take(&mut state.pending);
         for (number, change) in &pending {
-            let is_possible = match change {
-                Change::Unlink { after: Some(link), .. } => {
-                    !pending.contains_key(link) || kept_changes.contains(link)
-                }
-                _ => true,
-            };
+            let may_follow = |link: usize| !pending.contains_key(&link) || kept_changes.contains(&link);
+            let is_possible = change.after.is_none_or(may_follow);
             if is_possible && random.below(2) == 0 {
                 kept_changes.insert(*number);
                 state.apply(change);
@@ -156,20 +136,24 @@ fn torn(inode: &Inode, random: &mut Random) -> Vec<u8> {
 }
 
 impl Disk {
+    fn free_bytes(&self) -> u64 {
+        self.capacity_bytes.map_or(u64::MAX, |capacity| capacity.saturating_sub(self.used_bytes()))
+    }
+
     fn used_bytes(&self) -> u64 {
         self.live.values().map(|inode| self.inodes[*inode].live.len() as u64).sum()
     }
 
-    fn change(&mut self, change: Change) -> usize {
+    fn change(&mut self, path: &Path, inode: Option<usize>, after: Option<usize>) -> usize {
         self.n_changes += 1;
-        self.pending.insert(self.n_changes, change);
+        self.pending.insert(self.n_changes, Change { path: path.to_owned(), inode, after });
         self.n_changes
     }
 
     fn apply(&mut self, change: &Change) {
-        match change {
-            Change::Link { path, inode } => drop(self.durable.insert(path.clone(), *inode)),
-            Change::Unlink { path, .. } => drop(self.durable.remove(path)),
+        match change.inode {
+            Some(inode) => drop(self.durable.insert(change.path.clone(), inode)),
+            None => drop(self.durable.remove(&change.path)),
         }
     }
 
@@ -189,20 +173,16 @@ impl SimFiles {
         let mut state = self.0.lock().expect("sound");
         state.check_power()?;
         state.n_steps += 1;
-        if state.cut_at == Some(state.n_steps) {
-            if Random::new(state.random).below(2) == 0 {
-                work(&mut state)?;
-            }
-            state.is_cut = true;
-            return state.check_power();
+        let is_cut = state.cut_at == Some(state.n_steps);
+        if !is_cut && state.fail_at != Some(state.n_steps) {
+            return work(&mut state);
         }
-        if state.fail_at == Some(state.n_steps) {
-            if Random::new(state.random ^ 1).below(2) == 0 {
-                work(&mut state)?;
-            }
-            return Err(io::Error::other("the medium fails"));
+        if Random::new(state.random ^ u64::from(!is_cut)).below(2) == 0 {
+            work(&mut state)?;
         }
-        work(&mut state)
+        state.is_cut = is_cut;
+        state.check_power()?;
+        Err(io::Error::other("the medium fails"))
     }
 
     fn look<T>(&self, work: impl FnOnce(&Disk) -> io::Result<T>) -> io::Result<T> {
@@ -225,14 +205,12 @@ impl Files for SimFiles {
                     state.inodes.push(Inode::default());
                     let inode = state.inodes.len() - 1;
                     state.live.insert(path.to_owned(), inode);
-                    state.change(Change::Link { path: path.to_owned(), inode });
+                    state.change(path, Some(inode), None);
                     inode
                 }
             };
             state.inodes[inode].live.resize(offset_bytes as usize, 0);
-            let free_bytes =
-                state.capacity_bytes.map_or(u64::MAX, |capacity| capacity.saturating_sub(state.used_bytes()));
-            let n_fitting = bytes.len().min(free_bytes as usize);
+            let n_fitting = bytes.len().min(state.free_bytes() as usize);
             state.inodes[inode].live.extend_from_slice(&bytes[..n_fitting]);
             if n_fitting < bytes.len() {
                 return Err(io::Error::new(io::ErrorKind::StorageFull, "no space left"));
@@ -254,25 +232,19 @@ impl Files for SimFiles {
             let inode = state.inode(from)?;
             state.live.remove(from);
             state.live.insert(to.to_owned(), inode);
-            let link = state.change(Change::Link { path: to.to_owned(), inode });
-            state.change(Change::Unlink { path: from.to_owned(), after: Some(link) });
+            let link = state.change(to, Some(inode), None);
+            state.change(from, None, Some(link));
             Ok(())
         })
     }
 
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {
         self.step(|state| {
-            let here: Vec<(usize, Change)> = state
-                .pending
-                .iter()
-                .filter(|(_, change)| change.dir() == Some(dir))
-                .map(|(number, change)| (*number, change.clone()))
-                .collect();
-            for (number, change) in here {
-                let waits = matches!(change, Change::Unlink { after: Some(link), .. } if state.pending.contains_key(&link));
-                if !waits {
-                    state.apply(&change);
-                    state.pending.remove(&number);
+            let all = state.pending.clone();
+            for (number, change) in all.iter().filter(|(_, change)| change.path.parent() == Some(dir)) {
+                if !change.after.is_some_and(|link| state.pending.contains_key(&link)) {
+                    state.apply(change);
+                    state.pending.remove(number);
                 }
             }
             Ok(())
@@ -282,7 +254,7 @@ impl Files for SimFiles {
     fn remove(&self, path: &Path) -> io::Result<()> {
         self.step(|state| {
             if state.live.remove(path).is_some() {
-                state.change(Change::Unlink { path: path.to_owned(), after: None });
+                state.change(path, None, None);
             }
             Ok(())
         })
@@ -321,9 +293,6 @@ impl Files for SimFiles {
     }
 
     fn free_bytes(&self, _dir: &Path) -> io::Result<u64> {
-        self.look(|state| {
-            let capacity = state.capacity_bytes.filter(|_| !state.hides_free_space);
-            Ok(capacity.map_or(u64::MAX, |capacity| capacity.saturating_sub(state.used_bytes())))
-        })
+        self.look(|state| Ok(if state.hides_free_space { u64::MAX } else { state.free_bytes() }))
     }
 }

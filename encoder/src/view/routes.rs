@@ -3,14 +3,14 @@
 use std::iter;
 use std::sync::Arc;
 
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Query, State};
+use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Json, Router};
+use serde::Deserialize;
 use serde_json::{Value, json};
 use slag_common::objects::parse_public_id;
-use slag_service::params::PathText;
+use slag_service::params::{Params, PathText, RequestError};
 use slag_service::problem::Problem;
 use slag_view::{Description, Step, Words};
 
@@ -26,7 +26,24 @@ const MAX_PHOTO_BYTES: u64 = 64 << 20;
 const BINARY: [(header::HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];
 
 type AppState = State<Arc<Viewer>>;
-type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
+
+#[derive(Deserialize)]
+struct CellParams {
+    generation: Option<u64>,
+    step: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct Question {
+    text: String,
+    #[serde(default)]
+    negative: Vec<String>,
+}
+
+#[derive(Deserialize)]
+struct Page {
+    limit: Option<usize>,
+}
 
 pub(crate) fn router(viewer: Viewer) -> Router {
     Router::new()
@@ -58,30 +75,33 @@ async fn words(State(viewer): AppState) -> Result<Json<Words>, Problem> {
     blocking(viewer, Viewer::words).await.map(Json)
 }
 
-async fn cell(State(viewer): AppState, PathText(id): PathText, pairs: Pairs) -> Result<Response, Problem> {
-    let pairs = read(pairs, &["generation", "step"])?;
+async fn cell(
+    State(viewer): AppState,
+    PathText(id): PathText,
+    Params(CellParams { generation, step }): Params<CellParams>,
+) -> Result<Response, Problem> {
     let cell_id = number("id", &id)?;
-    let of = |wanted: &str| pairs.iter().find(|(name, _)| name == wanted);
-    let generation = of("generation").map(|(name, value)| number(name, value)).transpose()?;
-    let step = of("step").map_or(Ok(Step::ALL), |(_, value)| Step::parse(value));
-    let step = step.map_err(|expected| bad(format!("step: expected {expected}")))?;
+    let step = step.map_or(Ok(Step::ALL), |value| {
+        Step::parse(&value).map_err(|expected| RequestError::new("step", &value, expected))
+    })?;
     let bytes = blocking(viewer, move |viewer| viewer.cell(cell_id, generation, step)).await?;
     Ok((BINARY, bytes).into_response())
 }
 
-async fn scores(State(viewer): AppState, pairs: Pairs) -> Result<Response, Problem> {
-    let (text, negatives) = question(&read(pairs, &["text", "negative"])?)?;
+async fn scores(State(viewer): AppState, Params(asked): Params<Question>) -> Result<Response, Problem> {
+    let Question { text, negative: negatives } = asked.checked()?;
     let work = move |viewer: &Viewer| {
         viewer.asked(&text, &negatives, |generation, vectors| generation.scores(vectors))
     };
     Ok((BINARY, blocking(viewer, work).await?).into_response())
 }
 
-async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Problem> {
-    let pairs = read(pairs, &["text", "negative", "limit"])?;
-    let (text, negatives) = question(&pairs)?;
-    let limit = pairs.iter().find(|(name, _)| name == "limit");
-    let limit = limit.map_or(Ok(DEFAULT_LIMIT), |(name, value)| number(name, value))?.min(MAX_LIMIT);
+async fn query(
+    State(viewer): AppState,
+    Params((asked, page)): Params<(Question, Page)>,
+) -> Result<Json<Value>, Problem> {
+    let Question { text, negative: negatives } = asked.checked()?;
+    let limit = page.limit.unwrap_or(DEFAULT_LIMIT).min(MAX_LIMIT);
     let work = move |viewer: &Viewer| {
         let mut reply = viewer.asked(&text, &negatives, |generation, vectors| {
             Ok(generation.things.answers(generation.reader.manifest(), &text, vectors, limit))
@@ -98,7 +118,7 @@ async fn changes(State(viewer): AppState) -> Result<Json<Diff>, Problem> {
 }
 
 async fn thumbnail(State(viewer): AppState, PathText(id): PathText) -> Result<Response, Problem> {
-    let wanted = parse_public_id(&id).ok_or_else(|| bad("id: expected o and 16 hex digits"))?;
+    let wanted = parse_public_id(&id).ok_or_else(|| RequestError::new("id", &id, "o and 16 hex digits"))?;
     let picture = blocking(viewer, move |viewer| viewer.thumbnail(wanted)).await?;
     let gone = || {
         let detail = format!("the store has no picture of {id}");
@@ -124,35 +144,20 @@ async fn photo(State(viewer): AppState, PathText(number): PathText) -> Result<Re
     Ok(([(header::CONTENT_TYPE, kind)], bytes).into_response())
 }
 
-fn bad(detail: impl Into<String>) -> Problem {
-    Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", detail)
+fn number<T: std::str::FromStr>(name: &str, value: &str) -> Result<T, RequestError> {
+    value.parse().map_err(|_| RequestError::new(name, value, "a whole number"))
 }
 
-/// Refuses unknown parameters.
-fn read(pairs: Pairs, known: &[&str]) -> Result<Vec<(String, String)>, Problem> {
-    let Query(pairs) = pairs.map_err(|e| bad(e.body_text()))?;
-    match pairs.iter().find(|(name, _)| !known.contains(&name.as_str())) {
-        Some((name, _)) => {
-            let name: String = name.chars().take(40).collect();
-            Err(bad(format!("{:?} is unknown, expected one of {}", name, known.join(", "))))
+impl Question {
+    fn checked(self) -> Result<Self, RequestError> {
+        let n = self.negative.len();
+        if n > MAX_NEGATIVES {
+            let expected = format!("at most {MAX_NEGATIVES} of them");
+            return Err(RequestError::new("negative", &n.to_string(), expected));
         }
-        None => Ok(pairs),
+        match self.text.trim().is_empty() {
+            true => Err(RequestError::new("text", &self.text, "words to look for")),
+            false => Ok(self),
+        }
     }
-}
-
-fn number<T: std::str::FromStr>(name: &str, value: &str) -> Result<T, Problem> {
-    let shown = || value.chars().take(40).collect::<String>();
-    value.parse().map_err(|_| bad(format!("{name} is {:?}, expected a whole number", shown())))
-}
-
-fn question(pairs: &[(String, String)]) -> Result<(String, Vec<String>), Problem> {
-    let of = |wanted: &'static str| {
-        pairs.iter().filter(move |(name, _)| name == wanted).map(|(_, value)| value.clone())
-    };
-    let negatives: Vec<String> = of("negative").collect();
-    if negatives.len() > MAX_NEGATIVES {
-        return Err(bad(format!("{} negatives, expected at most {MAX_NEGATIVES}", negatives.len())));
-    }
-    let text = of("text").next().filter(|text| !text.trim().is_empty());
-    Ok((text.ok_or_else(|| bad("text is missing: say what to look for"))?, negatives))
 }

@@ -39,29 +39,10 @@ fn status(access: &Access, method: Method, headers: &[(&str, &str)]) -> u16 {
 fn a_rebound_name_is_refused() {
     let access = access("127.0.0.1:7734", &["robot.local"], &[], None).expect("sound");
     let of = |host: &str| status(&access, Method::GET, &[("host", host)]);
-    for host in [
-        "127.0.0.1:7734",
-        "127.0.0.1",
-        "[::1]:7734",
-        "[::1]",
-        "localhost:7734",
-        "LOCALHOST",
-        "10.1.2.3",
-        "Robot.Local:80",
-    ] {
-        assert_eq!(of(host), 200, "{host}");
-    }
-    for host in [
-        "evil.example",
-        "evil.example:7734",
-        "127.0.0.1.evil.example",
-        "localhost.evil.example",
-        "",
-        ":7734",
-        "[evil]",
-    ] {
-        assert_eq!(of(host), 421, "{host}");
-    }
+    let own = "127.0.0.1:7734 127.0.0.1 [::1]:7734 [::1] localhost:7734 LOCALHOST 10.1.2.3 Robot.Local:80";
+    own.split(' ').for_each(|host| assert_eq!(of(host), 200, "{host}"));
+    let others = "evil.example evil.example:7734 127.0.0.1.evil.example localhost.evil.example :7734 [evil] ";
+    others.split(' ').for_each(|host| assert_eq!(of(host), 421, "{host}"));
     assert_eq!(status(&access.clone().with_any_host(), Method::GET, &[("host", "evil.example")]), 200);
 }
 

@@ -13,7 +13,6 @@ use slag_service::problem::Problem;
 
 use crate::http::app::App;
 use crate::http::forms::BallParams;
-use crate::http::problem::query_problem;
 use crate::query::{ChangesError, ChangesRequest, MAX_TEXTS, RequestError, Words};
 
 /// Which changes are asked for.
@@ -43,7 +42,7 @@ pub async fn changes(
     }
     let ball = ball.ball()?;
     let answering = app.within_limits(None, move |app, budget| {
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        let snapshot = app.engine.snapshot()?;
         let ball = match ball {
             Some((near, radius)) => Some((near.in_world("near", &snapshot.manifest)?, radius)),
             None => None,
@@ -56,7 +55,7 @@ pub async fn changes(
 fn problem(error: ChangesError) -> Problem {
     let (kind, detail) = (error.kind(), error.to_string());
     match error {
-        ChangesError::Query(error) => query_problem(error),
+        ChangesError::Query(error) => error.into(),
         ChangesError::NoSuchGeneration { .. } => {
             Problem::new(StatusCode::NOT_FOUND, kind, "No such generation", detail)
         }

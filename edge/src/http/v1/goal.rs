@@ -16,7 +16,6 @@ use slag_service::problem::Problem;
 use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, ObjectIdText, XyzText};
-use crate::http::problem::query_problem;
 use crate::query::{OnBoard, RequestError, Words};
 use crate::score::Budget;
 
@@ -56,10 +55,7 @@ pub async fn goal(
         _ => return Err(RequestError::new("text", "nothing", "the thing to go to, or its id as id").into()),
     };
     let request = GoalRequest { target, near: None, heading_rad: of.heading_rad, robot, stand };
-    answer(&app, place, request, |app, on_board, request, budget| {
-        goal::find(&app.engine, on_board, request, budget)
-    })
-    .await
+    answer(&app, place, request, goal::find).await
 }
 
 pub async fn floor(
@@ -67,7 +63,7 @@ pub async fn floor(
     Params((place, robot)): Params<(PlaceParams, Robot)>,
 ) -> Result<Json<Floor>, Problem> {
     let request = GoalRequest { robot, ..GoalRequest::new(GoalTarget::Text(String::new())) };
-    answer(&app, place, request, |_, on_board, request, budget| {
+    answer(&app, place, request, |on_board, request, budget| {
         let map = goal::floor_map(&on_board.snapshot, request, budget)?;
         Ok(Floor {
             generation: on_board.snapshot.manifest.generation,
@@ -85,18 +81,18 @@ async fn answer<T: Send + 'static>(
     app: &Arc<App>,
     place: PlaceParams,
     mut request: GoalRequest,
-    work: impl FnOnce(&App, &OnBoard, &GoalRequest, &Budget) -> Result<T, GoalError> + Send + 'static,
+    work: impl FnOnce(&OnBoard, &GoalRequest, &Budget) -> Result<T, GoalError> + Send + 'static,
 ) -> Result<Json<T>, Problem> {
     let near = forms::point(place.near, place.near_lat_lon)?;
     request.check()?;
     let answering = app.within_limits(None, move |app, budget| {
-        let on_board = app.engine.on_board().map_err(query_problem)?;
+        let on_board = app.engine.on_board()?;
         let manifest = &on_board.snapshot.manifest;
         request.near = match near {
             Some(near) => Some(near.in_world("near", manifest)?),
             None => app.last_position(manifest),
         };
-        work(app, &on_board, &request, budget).map(Json).map_err(problem)
+        work(&on_board, &request, budget).map(Json).map_err(problem)
     });
     answering.await
 }
@@ -104,7 +100,7 @@ async fn answer<T: Send + 'static>(
 fn problem(error: GoalError) -> Problem {
     let kind = error.kind();
     match error {
-        GoalError::Query(error) => query_problem(error),
+        GoalError::Query(error) => error.into(),
         error => Problem::new(StatusCode::CONFLICT, kind, "No places known", error.to_string()),
     }
 }

@@ -14,10 +14,9 @@ use slag_service::problem::Problem;
 
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, XyText, XyzText};
-use crate::http::problem::query_problem;
 use crate::locate::{Answer, Camera, LocateError, PhotoFile, answer, map_working_bytes};
-use crate::query::{Point, QueryError, RequestError};
-use crate::score::{MAX_COORDINATE, ScoreError};
+use crate::query::{Point, RequestError};
+use crate::score::MAX_COORDINATE;
 
 pub const PHOTOS: &[&str] = &["image/jpeg", "image/png", "image/webp"];
 
@@ -79,17 +78,16 @@ pub async fn locate(
 ) -> Result<Json<Answer>, Problem> {
     let (mut camera, near) = params.camera()?;
     app.within_limits(None, move |app, budget| {
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        let snapshot = app.engine.snapshot()?;
         if let Some((near, sigma)) = near {
             let position_in_world = near.in_world("near", &snapshot.manifest)?;
             camera.prior = Some(Prior { position_in_world, sigma });
         }
-        let over_budget = |spent| query_problem(QueryError::Score(ScoreError::OverBudget(spent)));
         budget.take(PhotoFile::opening_bytes(&photo));
-        budget.check().map_err(over_budget)?;
+        budget.check()?;
         let opened = PhotoFile::open(&photo).map_err(problem)?;
         budget.take(opened.working_bytes() + map_working_bytes(&snapshot));
-        budget.check().map_err(over_budget)?;
+        budget.check()?;
         answer(&snapshot, opened, &camera, budget).map(Json).map_err(problem)
     })
     .await

@@ -16,24 +16,21 @@ use slag_service::problem::Problem;
 use slag_service::routes::{Parameter, Routes};
 
 use super::forms::ObjectIdText;
-use super::problem::{BUDGET, NO_PLACES, SCENE, TEXTS, TIME_BUDGET};
+use super::problem::{BUDGET, FAILED, NO_PLACES, NO_SCENE, OTHER_MODEL, TIME_BUDGET, WORDS};
 use super::query;
 use crate::fetch::accepted;
 use crate::http::app::App;
-use crate::http::problem::query_problem;
 use crate::locate::MAX_PHOTO_BYTES;
 use crate::query::{Ask, map_status};
 
 pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
-    let to = view_routes(to)
+    view_routes(to)
         .get(
             "/v1/query",
             "things that match texts or relations, best first, in one shape of reply",
             query::get,
         )
-        .errors(&SCENE)
-        .errors(&TEXTS)
-        .errors(&[TIME_BUDGET])
+        .errors(&[FAILED, NO_SCENE, OTHER_MODEL, WORDS, TIME_BUDGET])
         .post::<Ask, _, _>(
             "/v1/query",
             "the same, asked in JSON: texts, vectors, phrases, areas",
@@ -41,35 +38,27 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
             query::post,
         )
         .reads()
-        .errors(&SCENE)
-        .errors(&TEXTS)
-        .errors(&[TIME_BUDGET])
+        .errors(&[FAILED, NO_SCENE, OTHER_MODEL, WORDS, TIME_BUDGET])
         .get("/v1/objects", "all things on board and what they are called, in pages", objects::list)
-        .errors(&SCENE)
-        .errors(&[BUDGET])
+        .errors(&[FAILED, NO_SCENE, BUDGET])
         .get("/v1/objects/{id}", "one thing on board", objects::one)
         .parameters([Parameter::of_path::<ObjectIdText>("id", "o and 16 hex digits")])
-        .errors(&SCENE)
-        .errors(&[(404, "No such thing is on board."), BUDGET])
+        .errors(&[FAILED, NO_SCENE, (404, "No such thing is on board."), BUDGET])
         .get("/v1/objects/{id}/thumbnail", "a small picture of a thing on board, JPEG", objects::thumbnail)
         .parameters([Parameter::of_path::<ObjectIdText>("id", "o and 16 hex digits")])
-        .errors(&SCENE)
-        .errors(&[(404, "No such thing is on board, or its shards have no pictures."), BUDGET])
+        .errors(&[FAILED, NO_SCENE, (404, "No such thing is on board, or its shards have no pictures."), BUDGET])
         .get("/v1/map", "the area on board, its age, and what is missing", map)
-        .errors(&SCENE)
+        .errors(&[FAILED, NO_SCENE])
         .get("/v1/changes", "things that appeared, went or moved between two generations", changes::changes)
-        .errors(&SCENE)
-        .errors(&[
+        .errors(&[FAILED, NO_SCENE,
             (404, "The robot does not remember a generation."),
             (409, "The generations were encoded with different models, or have no objects."),
-            TEXTS[1],
+            WORDS,
         ])
         .get("/v1/goal", "places to stand near a thing: reached, clear, and in sight of it", goal::goal)
-        .errors(&SCENE)
-        .errors(&[NO_PLACES, TEXTS[1]])
+        .errors(&[FAILED, NO_SCENE, NO_PLACES, WORDS])
         .get("/v1/floor", "the ground around the robot: unknown, obstacle, ground, reached", goal::floor)
-        .errors(&SCENE)
-        .errors(&[NO_PLACES, BUDGET])
+        .errors(&[FAILED, NO_SCENE, NO_PLACES, BUDGET])
         .post_bytes(
             "/v1/locate",
             "where the camera of a photo is: found, unsure with candidates, or lost",
@@ -78,9 +67,8 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
             locate::locate,
         )
         .reads()
-        .errors(&SCENE)
-        .errors(&[(409, "The landmarks on board are of another version."), BUDGET]);
-    to.get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
+        .errors(&[FAILED, NO_SCENE, (409, "The landmarks on board are of another version."), BUDGET])
+        .get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
         .details(
             "At first the present state. event: generation, with scene, generation, frame, n_cells, n_objects and n_bad_cells, or null without a scene; event: following, as the member following of /status. The stream ends when the service stops.",
         )
@@ -93,27 +81,23 @@ fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         "the scene on board as the page at /view draws it: cells, fetched area, robot",
         view::describe,
     )
-    .errors(&SCENE)
-    .errors(&[BUDGET])
+    .errors(&[FAILED, NO_SCENE, BUDGET])
     .get("/v1/view/scores", "the score of every Gaussian on board, a byte each, in binary", view::scores)
     .details(
         "Little-endian: the bytes SLGS, version 1 (u32), least and largest score (f32 each), number of cells and generation (u32 each); for each cell its id and number of Gaussians (u32 each); then a byte b for each Gaussian: 0 if no view shows it, else its centroid's score is least + b / 255 * (largest - least). With negatives, scores are relevancies.",
     )
-    .errors(&SCENE)
-    .errors(&TEXTS)
+    .errors(&[FAILED, NO_SCENE, OTHER_MODEL, WORDS])
     .get("/v1/view/words", "words to ask for, and how many things on board each finds", view::words)
     .details(
         "Those of most things first: all that the text model knows, or of one that takes any text everyday words that find something.",
     )
-    .errors(&SCENE)
-    .errors(&TEXTS)
+    .errors(&[FAILED, NO_SCENE, OTHER_MODEL, WORDS])
     .get("/v1/view/cells/{id}", "the Gaussians of a cell, 16 bytes each, in binary", view::cell)
     .details(
         "Little-endian: the bytes SLGG, version 1 and number of Gaussians N (u32 each), origin in the world (f32 x 3), flags (u32; 1: the appearance is known), step (u32); then columns: centres less the origin (f16 x 3), colours (u8 x 3), opacities (u8), sizes and rotations (u8 x 3 each, see docs/formats.md).",
     )
     .parameters([Parameter::of_path::<u32>("id", "the cell's id").limit("maximum", u32::MAX)])
-    .errors(&SCENE)
-    .errors(&[
+    .errors(&[FAILED, NO_SCENE,
         (404, "The cell is not on board, or another generation is."),
         BUDGET,
     ])
@@ -123,7 +107,7 @@ fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
 async fn map(State(app): State<Arc<App>>) -> Result<Json<MapStatus>, Problem> {
     app.blocking(|app| {
         app.reload_if_stale();
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        let snapshot = app.engine.snapshot()?;
         let expires_unix_secs =
             accepted(app.engine.cache()).ok().flatten().and_then(|accepted| accepted.expires_unix_secs);
         Ok(Json(map_status(&snapshot, crate::now_unix_secs(), expires_unix_secs)))

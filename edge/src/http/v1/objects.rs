@@ -16,8 +16,7 @@ use slag_service::replies::{As, Binary, Described, Reply};
 
 use crate::http::app::App;
 use crate::http::forms::{AreaParams, BallParams, ObjectIdText};
-use crate::http::problem::query_problem;
-use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError};
+use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError, Scene};
 use crate::store::Snapshot;
 
 const DEFAULT_PAGE: usize = 100;
@@ -78,10 +77,9 @@ pub async fn list(
 ) -> Result<As<ListFormats>, Problem> {
     let (limit, format, area) = (params.limit, params.format, area.area(ball.ball()?)?);
     let listing = app.within_limits(None, move |app, budget| {
-        let on_board = app.engine.on_board().map_err(query_problem)?;
+        let on_board = app.engine.on_board()?;
         let filter = params.filter(area, &on_board.snapshot.manifest)?;
-        let page =
-            app.engine.objects(&on_board, &filter, limit, NAMES_WAIT, budget).map_err(query_problem)?;
+        let page = app.engine.objects(&on_board, &filter, limit, NAMES_WAIT, budget)?;
         format.write(&page).map_err(Problem::internal)
     });
     Ok(As::new(([(header::CONTENT_TYPE, format.media_type())], listing.await?)))
@@ -117,10 +115,11 @@ pub async fn one(
 ) -> Result<Json<ObjectOnBoard>, Problem> {
     let wanted = wanted(&id)?;
     app.within_limits(None, move |app, budget| {
-        let on_board = app.engine.on_board().map_err(query_problem)?;
+        let on_board = app.engine.on_board()?;
         let snapshot = &on_board.snapshot;
-        let names = app.engine.names(&on_board, NAMES_WAIT, budget).map_err(query_problem)?;
-        let found = app.engine.object(snapshot, names, wanted, budget).map_err(query_problem)?;
+        let names = app.engine.names(&on_board, NAMES_WAIT, budget)?;
+        let found = Scene::of(snapshot).object(wanted, names, budget);
+        budget.check()?;
         found.map(Json).ok_or_else(|| not_on_board(&id, snapshot))
     })
     .await
@@ -133,8 +132,10 @@ pub async fn thumbnail(
 ) -> Result<As<JpegPicture>, Problem> {
     let wanted = wanted(&id)?;
     let picture = app.within_limits(None, move |app, budget| {
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let picture = app.engine.thumbnail(&snapshot, wanted, budget).map_err(query_problem)?;
+        let snapshot = app.engine.snapshot()?;
+        let picture = Scene::of(&snapshot).thumbnail(wanted);
+        budget.take(picture.iter().flatten().map(Vec::len).sum());
+        budget.check()?;
         picture.ok_or_else(|| not_on_board(&id, &snapshot))?.ok_or_else(|| {
             let detail = format!(
                 "{id} has no small picture on board; balanced and exact shards carry them, and compact ones of a store encoded with --appearance"

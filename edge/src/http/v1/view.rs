@@ -13,7 +13,6 @@ use slag_service::replies::{As, Binary};
 use slag_view::{Description, Step};
 
 use crate::http::app::App;
-use crate::http::problem::query_problem;
 use crate::query::{MAX_NEGATIVES, QueryError, RequestError, Words};
 use crate::score::Budget;
 
@@ -45,8 +44,7 @@ pub struct CellParams {
 
 pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, Problem> {
     app.within_limits(None, |app, budget| {
-        let described = app.engine.view(|snapshot| app.last_position(&snapshot.manifest), budget);
-        described.map(Json).map_err(query_problem)
+        Ok(Json(app.engine.view(|snapshot| app.last_position(&snapshot.manifest), budget)?))
     })
     .await
 }
@@ -73,8 +71,7 @@ pub async fn cell(
 }
 
 pub async fn words(State(app): State<Arc<App>>) -> Result<Json<slag_view::Words>, Problem> {
-    app.within_limits(None, |app, budget| app.engine.view_words(budget).map(Json).map_err(query_problem))
-        .await
+    app.within_limits(None, |app, budget| Ok(Json(app.engine.view_words(budget)?))).await
 }
 
 async fn message(
@@ -82,8 +79,7 @@ async fn message(
     make: impl FnOnce(&App, &Budget) -> Result<Option<Vec<u8>>, QueryError> + Send + 'static,
 ) -> Result<As<Binary>, Problem> {
     let making = app.within_limits(None, move |app, budget| {
-        let made = make(app, budget).map_err(query_problem)?;
-        made.ok_or_else(|| {
+        make(app, budget)?.ok_or_else(|| {
             let detail =
                 "the cell is not on board, or of another generation; GET /v1/view lists those that are";
             Problem::new(StatusCode::NOT_FOUND, "no-such-cell", "No such cell", detail)

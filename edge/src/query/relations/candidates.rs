@@ -138,7 +138,7 @@ fn candidates<'a>(
     scored: &ObjectScores,
     request: &QueryRequest,
 ) -> (Found, Vec<Candidate<'a>>) {
-    let (scale, calibration) = (Scale::of(question), objects::calibration(scene.objects));
+    let (scale, calibration) = (Scale::of(question), objects::calibration(&scene.objects));
     let (threshold, _) = scale.threshold(request, scene.manifest, calibration);
     let everywhere = Region::default();
     let min_count = request.min_count;

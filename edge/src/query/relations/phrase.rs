@@ -72,20 +72,6 @@ pub enum Relation {
 slag_common::named_members!(Phrase, Place, Pick; Serialize);
 
 impl Relation {
-    pub const ALL: [Self; 11] = [
-        Self::On,
-        Self::Under,
-        Self::Above,
-        Self::In,
-        Self::Near,
-        Self::Beside,
-        Self::Between,
-        Self::LeftOf,
-        Self::RightOf,
-        Self::InFrontOf,
-        Self::Behind,
-    ];
-
     pub fn is_seen(self) -> bool {
         matches!(self, Self::LeftOf | Self::RightOf | Self::InFrontOf | Self::Behind)
     }

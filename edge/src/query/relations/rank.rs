@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::candidates::{Candidate, SURE, Things};
 use super::geometry::{self, HOLDS, Solid, Viewer};
 use super::phrase::{By, Phrase, Pick, Place};
-use crate::query::answers::{Reason, ReasonKind};
+use crate::query::reason::{Reason, ReasonKind};
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
@@ -45,8 +45,6 @@ struct Anchor {
     solid: Solid,
     score: f64,
     witness: Witness,
-    /// Public id; absent for the asker.
-    id: Option<String>,
 }
 
 struct Measure<'a, 'b> {
@@ -63,12 +61,9 @@ pub fn relate(
     metre: f64,
 ) -> Result<Vec<Related>, Reason> {
     let of = things.of(&phrase.thing);
-    let missing = || {
-        let detail = format!("nothing {} is in the region asked for", quoted(&phrase.thing));
-        miss(ReasonKind::NotInRegion, &phrase.thing, detail)
-    };
     if !of.is_empty() && !of.iter().any(|candidate| candidate.is_inside) {
-        return Err(missing());
+        let detail = format!("nothing {} is in the region asked for", quoted(&phrase.thing));
+        return Err(miss(ReasonKind::NotInRegion, &phrase.thing, detail));
     }
     Measure { things, viewer, metre }.matches(phrase, |candidate| candidate.is_inside)
 }
@@ -84,8 +79,14 @@ impl<'b> Measure<'_, 'b> {
             let detail = format!("nothing on board is {}", quoted(&phrase.thing));
             return Err(miss(ReasonKind::NoSuchThing, &phrase.thing, detail));
         }
+        let alone = |(candidate, of): (usize, &Candidate<'_>)| Related {
+            candidate,
+            score: of.confidence,
+            degree: 1.0,
+            to: Vec::new(),
+        };
         let mut found = match &phrase.relation {
-            None => (0..all.len()).map(|at| alone(at, &all[at])).collect(),
+            None => all.iter().enumerate().map(alone).collect(),
             Some(place) => self.placed(phrase, place)?,
         };
         found.retain(|related| is_asked_for(&all[related.candidate]));
@@ -119,7 +120,7 @@ impl<'b> Measure<'_, 'b> {
                     best = Some(Related { candidate, score, degree, to });
                 }
             };
-            let is_other = |anchor: &&Anchor| anchor.id.as_deref() != Some(&thing.id);
+            let is_other = |anchor: &&Anchor| anchor.witness.id.as_deref() != Some(&thing.id);
             for one in ones.iter().filter(is_other) {
                 match &others {
                     None => {
@@ -128,7 +129,8 @@ impl<'b> Measure<'_, 'b> {
                         consider(degree, one.score, &[one]);
                     }
                     Some((_, others)) => {
-                        for other in others.iter().filter(is_other).filter(|other| other.id != one.id) {
+                        let is_third = |other: &&Anchor| other.witness.id != one.witness.id;
+                        for other in others.iter().filter(is_other).filter(is_third) {
                             let degree = geometry::between(&thing.solid, &one.solid, &other.solid);
                             consider(degree, one.score * other.score, &[one, other]);
                         }
@@ -153,7 +155,7 @@ impl<'b> Measure<'_, 'b> {
             let at = self.viewer.map_or(DVec3::ZERO, |viewer| viewer.position_in_world);
             let witness =
                 Witness { thing: phrase.thing.clone(), id: None, position_in_world: at, score: None };
-            return Ok(vec![Anchor { solid: Solid::point(at), score: 1.0, witness, id: None }]);
+            return Ok(vec![Anchor { solid: Solid::point(at), score: 1.0, witness }]);
         }
         let all = self.things.of(&phrase.thing);
         let found = self.matches(phrase, |_| true)?.into_iter();
@@ -165,7 +167,7 @@ impl<'b> Measure<'_, 'b> {
                 position_in_world: of.position_in_world(),
                 score: Some(of.score),
             };
-            Anchor { solid: of.solid, score: related.score, witness, id: Some(of.id.clone()) }
+            Anchor { solid: of.solid, score: related.score, witness }
         };
         Ok(found.map(anchor).collect())
     }
@@ -182,7 +184,7 @@ impl<'b> Measure<'_, 'b> {
         // The surest one that distances are counted from.
         let origin = from.first();
         found.retain(|related| {
-            origin.is_none_or(|origin| origin.id.as_ref() != Some(&all[related.candidate].id))
+            origin.is_none_or(|origin| origin.witness.id.as_ref() != Some(&all[related.candidate].id))
         });
         let key = |of: &Related| match (pick.by, &all[of.candidate].solid, origin) {
             (By::Largest, solid, _) => -solid.volume(),
@@ -194,7 +196,7 @@ impl<'b> Measure<'_, 'b> {
         found.sort_by(|a, b| key(a).total_cmp(&key(b)).then(a.candidate.cmp(&b.candidate)));
         let n = found.len();
         if n < pick.n {
-            let detail = format!("{} was asked for, but {n} fit", nth(pick.n, &phrase.thing));
+            let detail = format!("number {} of {} was asked for, but {n} fit", pick.n, quoted(&phrase.thing));
             return Err(miss(ReasonKind::TooFew, &phrase.thing, detail));
         }
         let mut chosen = found.swap_remove(pick.n - 1);
@@ -203,16 +205,8 @@ impl<'b> Measure<'_, 'b> {
     }
 }
 
-fn alone(candidate: usize, thing: &Candidate<'_>) -> Related {
-    Related { candidate, score: thing.confidence, degree: 1.0, to: Vec::new() }
-}
-
 /// Quotes a text of a client: cut, and control characters escaped.
 fn quoted(text: &str) -> String {
     let cut: String = text.chars().take(40).collect();
     format!("{cut:?}")
-}
-
-fn nth(n: usize, thing: &str) -> String {
-    format!("number {n} of {}", quoted(thing))
 }

@@ -1,23 +1,12 @@
 use std::time::Duration;
 
 use super::*;
-use crate::score::{Budget, OverBudget, Pool, ScoreError};
+use crate::score::{OverBudget, Pool, ScoreError};
 
 /// A request gets its answer or an error that names the budget, and releases its memory in both cases.
 #[test]
 fn a_budget_is_enough_or_is_named() {
     let yard = yard();
-    let shards: Vec<_> = yard.iter().map(BuiltShard::view).collect();
-    let objects: Vec<_> = yard.iter().map(|shard| shard.layout.additions(&shard.bytes).objects).collect();
-    let (index, manifest) = (ObjectIndex::new(&objects), manifest_of(&yard, 7));
-    let scene = Scene {
-        shards: &shards,
-        objects: &objects,
-        index: &index,
-        manifest: &manifest,
-        fetched: (DVec3::ZERO, 50.0),
-        bad_cells: &[],
-    };
     let questions = [Question::new([1.0, 0.0]), Question::new([0.6, 0.8])];
     let pool = Pool::new(u64::MAX);
     for kind in [AnswerKind::Clusters, AnswerKind::Gaussians] {
@@ -31,9 +20,8 @@ fn a_budget_is_enough_or_is_named() {
             ..QueryRequest::new("thing")
         };
         let ask = |budget: Budget| {
-            let mut scratch = Scratch::default();
-            scratch.set_budget(budget);
-            answer(&mut scratch, &scene, (&["thing", "other"], &questions), &request)
+            let labels = ["thing", "other"];
+            on_scene(&yard, |scene| answer(scene, (&labels, &questions), &request, &budget))
         };
         let expected = ask(Budget::default()).expect("without bounds");
         let (mut n_refused, mut is_answered) = (0, false);

@@ -1,6 +1,6 @@
 //! NEON kernels. Loops only: closures would be compiled for the baseline processor.
 
-use std::arch::aarch64::{int8x16_t, int16x8_t, uint8x16_t, uint16x8_t};
+use std::arch::aarch64::{int8x16_t, int16x8_t, uint8x16_t};
 
 use bytemuck::cast;
 use pulp::aarch64::Neon;
@@ -53,17 +53,5 @@ impl Kernels for Neon {
             }
         }
         cast(sums)
-    }
-
-    #[inline(always)]
-    fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32 {
-        let neon = self.neon;
-        let least = neon.vdupq_n_u16(least);
-        let bits: uint16x8_t = cast([1u16, 2, 4, 8, 16, 32, 64, 128]);
-        let mut mask = [0u8; 4];
-        for (mask, sums) in mask.iter_mut().zip(cast::<_, [uint16x8_t; 4]>(*sums)) {
-            *mask = neon.vaddvq_u16(neon.vandq_u16(neon.vcgeq_u16(sums, least), bits)) as u8;
-        }
-        u32::from_le_bytes(mask)
     }
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
 use slag_common::shard::{Profile, ShardView};
-use slag_edge::score::{Precision, Question, Region, Scratch, Search};
+use slag_edge::score::{Precision, Question, Region, Search};
 use slag_edge::store::{EdgeCache, Snapshot};
 use slag_encoder::cli::common::{ModelArgs, open_models};
 use slag_math::random::Random;
@@ -117,15 +117,13 @@ pub(crate) fn run(args: &QueryArgs) -> Result<QueryReport> {
     })
 }
 
-/// Times both kinds of answers, with buffers that a process keeps between queries.
+/// Times both kinds of answers.
 fn time(shards: &[ShardView<'_>], questions: &[Question], limit: usize, args: &QueryArgs) -> Result<Timing> {
-    let mut scratch = Scratch::default();
     let position = |shard: u32, index: u32| shards[shard as usize].position_in_world(index as usize);
     let n_runs = args.runs as usize;
     let question = |turn: usize| &questions[turn % questions.len()];
     let best = Times::measure(N_WARM_UP, n_runs, |turn| -> Result<()> {
-        let search =
-            Search::reusing(&mut scratch, shards, question(turn), Region::default(), args.precision)?;
+        let search = Search::new(shards, question(turn), Region::default(), args.precision)?;
         let hits = search.best(limit, f32::NEG_INFINITY, None).into_par_iter();
         black_box(hits.map(|hit| position(hit.shard, hit.index)).collect::<Vec<_>>());
         Ok(())
@@ -136,8 +134,7 @@ fn time(shards: &[ShardView<'_>], questions: &[Question], limit: usize, args: &Q
     };
     let thresholds = questions.iter().map(last).collect::<Result<Vec<f32>>>()?;
     let threshold = Times::measure(N_WARM_UP, n_runs, |turn| -> Result<()> {
-        let search =
-            Search::reusing(&mut scratch, shards, question(turn), Region::default(), args.precision)?;
+        let search = Search::new(shards, question(turn), Region::default(), args.precision)?;
         let runs = search.matching(thresholds[turn % thresholds.len()]).runs.into_par_iter();
         let positions = runs.flat_map_iter(|run| (run.start..run.end).map(move |at| position(run.shard, at)));
         black_box(positions.collect::<Vec<_>>());

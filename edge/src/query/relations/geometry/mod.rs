@@ -191,21 +191,10 @@ fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, metre: f64)
     let Some(away) = (if is_asker { heading.map(|ahead| -ahead) } else { sight.try_normalize() }) else {
         return 0.0;
     };
+    let left = if is_asker { -away.perp() } else { away.perp() };
     let meant = match is {
-        Relation::LeftOf => {
-            if is_asker {
-                -away.perp()
-            } else {
-                away.perp()
-            }
-        }
-        Relation::RightOf => {
-            if is_asker {
-                away.perp()
-            } else {
-                -away.perp()
-            }
-        }
+        Relation::LeftOf => left,
+        Relation::RightOf => -left,
         Relation::InFrontOf => -away,
         _ => away,
     };

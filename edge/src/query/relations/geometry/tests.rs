@@ -3,6 +3,7 @@ use proptest::prelude::*;
 use slag_common::frames::Aabb;
 
 use super::*;
+use crate::query::relations::grammar::RELATIONS;
 use glam::DVec3;
 
 const METRES: f64 = 1.0;
@@ -178,7 +179,7 @@ proptest! {
         let viewer = Viewer { position_in_world: DVec3::new(5.0, 1.0, 0.0), heading_rad: Some(0.3) };
         let at = DVec2::from_angle(yaw).rotate(viewer.position_in_world.truncate());
         let other = Viewer { position_in_world: at.extend(0.0), heading_rad: Some(0.3 + yaw) };
-        for is in Relation::ALL {
+        for (is, _) in RELATIONS {
             let one = degree(is, &a, &b, Some(&viewer), METRES);
             let turn = |of: &Solid| turned(*of, yaw, DVec2::ZERO);
             let two = degree(is, &turn(&a), &turn(&b), Some(&other), METRES);
@@ -192,7 +193,7 @@ fn flat_and_empty_boxes_have_degrees_too() {
     let flat = solid([0.0; 3], [1.0, 0.0, 0.0]);
     let nothing = Solid::of_aabb(&Aabb { min: DVec3::ZERO, max: DVec3::ZERO });
     let viewer = Viewer { position_in_world: DVec3::ZERO, heading_rad: None };
-    for is in Relation::ALL {
+    for (is, _) in RELATIONS {
         for (a, b) in [(&flat, &nothing), (&nothing, &flat), (&nothing, &nothing)] {
             let degree = degree(is, a, b, Some(&viewer), METRES);
             assert!((0.0..=1.0).contains(&degree), "{is}: {degree}");
