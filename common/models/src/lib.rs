@@ -16,7 +16,6 @@ pub mod boundaries;
 pub mod clean;
 pub mod colours;
 pub mod commands;
-mod described;
 pub mod description;
 pub mod download;
 mod encoder;
@@ -45,7 +44,7 @@ mod words;
 
 pub use description::EncoderId;
 pub use encoder::{Crop, ImageEncoder, TextEncoder};
-pub use error::{InferenceError, ModelError, PhrasesError, TokenizerError};
+pub use error::{InferenceError, ModelError};
 pub use file_ref::ModelFile;
 pub use floats::Floats;
 pub use model_dir::ModelDir;

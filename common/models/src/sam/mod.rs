@@ -37,10 +37,10 @@ use crate::description::FILE_NAME;
 use crate::model_dir::{checked, sha256_of};
 use crate::placement::DeviceMemory;
 use crate::preprocess::{Filter, Window, resample, values_of_levels};
-use crate::session::{Model, SessionError, SessionOptions, Tensor};
+use crate::session::{Model, SessionOptions, Tensor};
 use crate::{Floats, ModelError};
 
-pub use description::{SamDescription, SamFiles, SegmentDescription};
+pub use description::{SamDescription, SegmentDescription, SegmenterKind};
 pub use names::MASKS_PER_PROMPT;
 
 /// An opened SAM. Each file runs one call at a time; the two files can run in parallel.
@@ -112,7 +112,7 @@ impl Sam {
         let description = SamDescription::read(&path)?;
         let files_root = dir.join(&description.files_root);
         let mut id = description.name.clone();
-        let sam = description.segment.files();
+        let sam = &description.segment;
         for file in [&sam.image_encoder, &sam.mask_decoder] {
             for part in file.parts() {
                 id = format!("{id} {}", hex::encode(sha256_of(&files_root, part)?));
@@ -132,7 +132,7 @@ impl Sam {
         Ok(Self {
             id: format!("{id} {:?} {:?} {size_px} px", sam.mean, sam.std),
             size_px,
-            is_stretched: description.segment.is_stretched(),
+            is_stretched: sam.kind == SegmenterKind::Sam2,
             values: values_of_levels(sam.mean, sam.std),
             encoder: Mutex::new(encoder),
             decoder: Mutex::new(decoder),
@@ -173,7 +173,7 @@ impl Sam {
     }
 
     /// `image` must have pixels.
-    pub fn embed(&self, image: &RgbImage) -> Result<Embedding, SessionError> {
+    pub fn embed(&self, image: &RgbImage) -> Result<Embedding, ModelError> {
         let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
         let shape = vec![1, 3, size, size];
         let (name, links) = (self.names.pixels.as_str(), &self.names.embeddings);
@@ -205,7 +205,7 @@ impl Sam {
         n_prompts: usize,
         points: &[[f32; 2]],
         labels: &[i64],
-    ) -> Result<Decoded, SessionError> {
+    ) -> Result<Decoded, ModelError> {
         let mut decoder = self.decoder.lock().unwrap_or_else(PoisonError::into_inner);
         let per_call = match self.names.is_one_by_one {
             true => 1,
@@ -215,15 +215,14 @@ impl Sam {
         let mut decoded = Decoded::default();
         let calls = points.chunks(per_call * n_points.max(1)).zip(labels.chunks(per_call * n_points.max(1)));
         for (points, labels) in calls {
-            let missing = self.prompts_per_call.map_or(0, |n| n * n_points - points.len());
-            if missing == 0 {
-                decoded.append(self.decode_call(&mut decoder, embedding, n_points, (points, labels))?);
-                continue;
+            // A decoder for a fixed number of prompts gets the first ones again in place of those that are missing.
+            let n = self.prompts_per_call.map_or(points.len(), |n| n * n_points);
+            let padded: Vec<_> = points.iter().cycle().take(n).copied().collect();
+            let labels: Vec<_> = labels.iter().cycle().take(n).copied().collect();
+            let mut found = self.decode_call(&mut decoder, embedding, n_points, (&padded, &labels))?;
+            if points.len() < n {
+                found.truncate(points.len() / n_points.max(1));
             }
-            let points: Vec<_> = points.iter().chain(points.iter().cycle().take(missing)).copied().collect();
-            let labels: Vec<_> = labels.iter().chain(labels.iter().cycle().take(missing)).copied().collect();
-            let mut found = self.decode_call(&mut decoder, embedding, n_points, (&points, &labels))?;
-            found.truncate(per_call - missing / n_points.max(1));
             decoded.append(found);
         }
         Ok(decoded)
@@ -236,7 +235,7 @@ impl Sam {
         embedding: &Embedding,
         n_points: usize,
         (points, labels): (&[[f32; 2]], &[i64]),
-    ) -> Result<Decoded, SessionError> {
+    ) -> Result<Decoded, ModelError> {
         let found = self.run_decoder(decoder, embedding, n_points, (points, labels))?;
         let mut found = found.into_iter();
         let mut next = || found.next().unwrap_or_default();
@@ -244,10 +243,8 @@ impl Sam {
         let logits_px = [masks.shape[4] as u32, masks.shape[3] as u32];
         // The upsampling needs 3; SAM's logits are never larger than the square.
         if logits_px.iter().any(|edge| !(3..=self.size_px).contains(edge)) {
-            let expected = format!("masks of 3 to {} px a side", self.size_px);
-            return Err(
-                decoder.layout_error(format!("masks are {} x {} px", logits_px[0], logits_px[1]), expected)
-            );
+            let found = format!("masks are {} x {} px", logits_px[0], logits_px[1]);
+            return Err(decoder.layout_error(&found, &format!("masks of 3 to {} px a side", self.size_px)));
         }
         Ok(Decoded {
             predicted_ious: scores.values.into_vec(),
@@ -264,7 +261,7 @@ impl Sam {
         embedding: &Embedding,
         n_points: usize,
         (points, labels): (&[[f32; 2]], &[i64]),
-    ) -> Result<Vec<Tensor>, SessionError> {
+    ) -> Result<Vec<Tensor>, ModelError> {
         let n = (points.len() / n_points.max(1)) as i64;
         let n_points = n_points as i64;
         let names = &self.names;
