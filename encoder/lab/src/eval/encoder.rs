@@ -95,7 +95,7 @@ impl Texts {
             materials: encode(
                 Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect(),
             )?,
-            absent: encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?,
+            absent: encode(ABSENT.split(", ").map(|thing| format!("a {thing}")).collect())?,
         })
     }
 }
@@ -151,7 +151,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
         threshold,
         found: share(found[0], 1),
         found_others: share(found[1], nouns.len() - 1),
-        found_absent: share(found[2], ABSENT.len()),
+        found_absent: share(found[2], texts.absent.len()),
         ms_per_crop: crop_times.median_ms,
         ms_per_text: text_times.median_ms,
     })

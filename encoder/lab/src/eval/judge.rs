@@ -24,32 +24,9 @@ const MIN_ANSWER: usize = 10;
 const SUBSETS: [usize; 3] = [19, 15, 10];
 
 /// Negative queries: categories absent from most scenes. Those that a scene does have are left out.
-pub(super) const ABSENT: [&str; 24] = [
-    "elephant",
-    "airplane",
-    "boat",
-    "piano",
-    "guitar",
-    "horse",
-    "cat",
-    "bird",
-    "fish",
-    "snake",
-    "banana",
-    "pizza",
-    "train",
-    "helicopter",
-    "bathtub",
-    "toilet",
-    "shower",
-    "umbrella",
-    "bicycle",
-    "motorcycle",
-    "tent",
-    "ladder",
-    "tractor",
-    "traffic light",
-];
+pub(super) const ABSENT: &str = "elephant, airplane, boat, piano, guitar, horse, cat, bird, fish, snake, banana, pizza, train, \
+    helicopter, bathtub, toilet, shower, umbrella, bicycle, motorcycle, tent, ladder, tractor, \
+    traffic light";
 
 /// What is scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
@@ -157,8 +134,8 @@ pub(crate) fn judge(
     };
     let mut asker = Asker { reader, objects: objects.as_ref(), encoder, settings, unknown: BTreeMap::new() };
     let classes = asker.classes(truth)?;
-    let thresholds = Thresholds::of(reader, objects.as_ref(), settings);
-    let abstained = asker.abstained(truth, thresholds.of_gaussians)?;
+    let threshold = settings.threshold.unwrap_or_else(|| default_threshold(reader, objects.as_ref()));
+    let abstained = asker.abstained(truth, threshold)?;
     let things = Things::of(truth, &classes);
     let whole = things.confusion(&classes, classes.len());
     let subset = |n: usize| {
@@ -167,20 +144,15 @@ pub(crate) fn judge(
         Subset { n_classes: n, miou: mean((0..n).map(iou)), macc: mean((0..n).map(accuracy)) }
     };
     let sizes = std::iter::once(classes.len()).chain(SUBSETS.into_iter().filter(|n| *n < classes.len()));
-    let of_class = |(c, class): (usize, &Class)| things.retrieval(c, class, &whole, thresholds.of_gaussians);
+    let of_class = |(c, class): (usize, &Class)| things.retrieval(c, class, &whole, threshold);
     let words: Vec<WordReport> = classes.iter().enumerate().map(of_class).collect();
     let is_unanswered = |(i, c): &&(usize, Option<usize>)| c.is_some() && classes[0].cosines[*i].is_nan();
     Ok(EvalReport {
         encoder: reader.manifest().encoder.name.clone(),
         profile: settings.profile,
         kind: if objects.is_some() { EvalKind::Objects } else { EvalKind::Gaussians },
-        instances: objects.as_ref().map(|objects| {
-            let ids: Vec<_> = classes.iter().map(|class| (class.word.clone(), class.ids.clone())).collect();
-            let scores: Vec<Vec<f32>> = classes.iter().map(|class| class.of_objects.clone()).collect();
-            let n_objects = objects.ids.len();
-            instances::report(truth, &objects.object_of, n_objects, &ids, &scores, thresholds.of_objects)
-        }),
-        threshold: thresholds.of_gaussians,
+        instances: objects.as_ref().map(|objects| instances::report(truth, objects)),
+        threshold,
         multi_class: sizes.map(subset).collect(),
         mean_iou_at_threshold: mean(words.iter().map(|w| w.iou_at_threshold)),
         mean_average_precision: mean(words.iter().map(|w| w.average_precision)),
@@ -198,8 +170,6 @@ struct Class {
     ids: Vec<u16>,
     /// `[N]`; NaN without evidence.
     cosines: Vec<f32>,
-    /// By object; empty where objects are not scored.
-    of_objects: Vec<f32>,
 }
 
 struct Asker<'a> {
@@ -211,8 +181,8 @@ struct Asker<'a> {
 }
 
 impl Asker<'_> {
-    /// Scores of Gaussians and of objects; `None` for a word unknown to the encoder.
-    fn score(&mut self, word: &str) -> Result<Option<(Vec<f32>, Vec<f32>)>> {
+    /// Scores of Gaussians, mixed with those of their objects; `None` for a word unknown to the encoder.
+    fn score(&mut self, word: &str) -> Result<Option<Vec<f32>>> {
         // A synonym's results say nothing about the word itself.
         let asked_as = self.encoder.known_phrases().and_then(|known| known.asked_as(word));
         let encoded = match asked_as {
@@ -230,18 +200,17 @@ impl Asker<'_> {
             Some(profile) => query::scores_of_shards(self.reader, &vector, profile)?,
             None => query::scores(self.reader, &vector)?,
         };
-        let of_objects = self.objects.map(|objects| objects.scores(&vector)).unwrap_or_default();
         if let Some(objects) = self.objects {
-            objects.overlay(&of_objects, &mut scores.cosines);
+            objects.overlay(&objects.scores(&vector), &mut scores.cosines);
         }
-        Ok(Some((scores.cosines, of_objects)))
+        Ok(Some(scores.cosines))
     }
 
     fn classes(&mut self, truth: &Truth) -> Result<Vec<Class>> {
         let mut classes = Vec::new();
         for (word, ids) in truth.categories() {
-            if let Some((cosines, of_objects)) = self.score(&word)? {
-                classes.push(Class { word, ids, cosines, of_objects });
+            if let Some(cosines) = self.score(&word)? {
+                classes.push(Class { word, ids, cosines });
             }
         }
         match self.unknown.first_key_value() {
@@ -260,8 +229,8 @@ impl Asker<'_> {
             things.any(|t| t.category.contains(word) || t.words.iter().any(|w| w.contains(word)))
         };
         let mut abstained = [0, 0];
-        for word in ABSENT.into_iter().filter(|word| !is_present(word)) {
-            if let Some((cosines, _)) = self.score(word)? {
+        for word in ABSENT.split(", ").filter(|word| !is_present(word)) {
+            if let Some(cosines) = self.score(word)? {
                 let n = cosines.iter().filter(|c| **c >= threshold).count();
                 abstained[0] += usize::from(n < MIN_ANSWER);
                 abstained[1] += 1;
@@ -271,28 +240,17 @@ impl Asker<'_> {
     }
 }
 
-struct Thresholds {
-    of_gaussians: f32,
-    of_objects: f32,
-}
-
-impl Thresholds {
-    fn of(reader: &StoreReader, objects: Option<&PublishedObjects>, settings: &JudgeSettings) -> Self {
-        let record = &reader.manifest().encoder;
-        let of_scene = record.default_threshold;
-        let of_objects = match (objects, record.calibration) {
-            // A scene's own threshold lies three spreads above the mean of the scores, here those of objects.
-            (Some(objects), Some(_)) => {
-                let Calibration { score_mean, score_spread } = objects.calibration;
-                (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
-            }
-            _ => of_scene,
-        };
-        let of_gaussians = if objects.is_some() { query::mixed(of_scene, of_objects) } else { of_scene };
-        Self {
-            of_gaussians: settings.threshold.unwrap_or(of_gaussians),
-            of_objects: settings.threshold.unwrap_or(of_objects),
+fn default_threshold(reader: &StoreReader, objects: Option<&PublishedObjects>) -> f32 {
+    let record = &reader.manifest().encoder;
+    let of_scene = record.default_threshold;
+    match (objects, record.calibration) {
+        // A scene's own threshold lies three spreads above the mean of the scores, here those of objects.
+        (Some(objects), Some(_)) => {
+            let Calibration { score_mean, score_spread } = objects.calibration;
+            query::mixed(of_scene, (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0))
         }
+        (Some(_), None) => query::mixed(of_scene, of_scene),
+        (None, _) => of_scene,
     }
 }
 

@@ -1,5 +1,5 @@
-//! Relations between things, judged on generated scenes: each question is asked of the robot's program as
-//! relations, as the plain phrase, and by the noun alone, and the answers are compared with the layout.
+//! Relations between things, judged on generated scenes: questions are asked of the robot's program, and the answers
+//! are compared with the layout.
 
 mod truth;
 
@@ -51,7 +51,6 @@ pub(crate) struct RelationsArgs {
 
 struct Question {
     asked: Asked,
-    thing: String,
     text: String,
     /// Indices of the things meant; empty if there is none.
     truth: Vec<usize>,
@@ -75,25 +74,20 @@ fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
     let (things, _) = read_things(&dir.join("scene"))?;
     let robot = middle(&things);
     let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
-    for question in questions(&things, robot) {
-        for way in Way::ALL {
-            let answered = ask(&service, &question, way, robot)?;
-            let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
-            let is_right = |at: &Option<usize>| at.is_some_and(|at| question.truth.contains(&at));
-            let distinct: BTreeSet<usize> = found.iter().copied().flatten().collect();
-            let counts = Counts {
-                n_questions: 1,
-                n_right: usize::from(match found.first() {
-                    Some(first) => is_right(first),
-                    None => question.truth.is_empty(),
-                }),
-                n_answers: found.len(),
-                n_answers_right: found.iter().filter(|at| is_right(at)).count(),
-                n_meant: question.truth.len(),
-                n_meant_found: distinct.iter().filter(|at| question.truth.contains(at)).count(),
-            };
-            report.count(question.asked, !question.truth.is_empty(), way, counts);
-        }
+    for Question { asked, text, truth } in questions(&things, robot) {
+        let answered = ask(&service, &text, robot)?;
+        let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
+        let is_right = |at: &Option<usize>| at.is_some_and(|at| truth.contains(&at));
+        let distinct: BTreeSet<usize> = found.iter().copied().flatten().collect();
+        let counts = Counts {
+            n_questions: 1,
+            n_right: usize::from(found.first().map_or(truth.is_empty(), is_right)),
+            n_answers: found.len(),
+            n_answers_right: found.iter().filter(|at| is_right(at)).count(),
+            n_meant: truth.len(),
+            n_meant_found: distinct.iter().filter(|at| truth.contains(at)).count(),
+        };
+        report.counts.entry((asked, !truth.is_empty())).or_default().add(counts);
     }
     Ok(())
 }
@@ -136,7 +130,7 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
                 }
                 let text = asked.text(thing, of);
                 let has_answer = usize::from(!truth.is_empty());
-                of_relation[has_answer].push(Question { asked, thing: (*thing).to_owned(), text, truth });
+                of_relation[has_answer].push(Question { asked, text, truth });
             }
         }
         for questions in of_relation {
@@ -147,20 +141,14 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     all
 }
 
-fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result<Vec<Value>> {
-    let near = [robot.x, robot.y, 0.0];
-    // Distance must not affect the plain phrase, so it is asked without a position.
-    let body = match way {
-        Way::Relations => json!({"texts": [question.text], "near": near, "limit": LIMIT}),
-        Way::Phrase => json!({"texts": [question.text], "relations": false, "limit": LIMIT}),
-        Way::Noun => json!({"texts": [question.thing], "relations": false, "limit": LIMIT}),
-    };
+fn ask(service: &Service, text: &str, robot: DVec3) -> Result<Vec<Value>> {
+    let body = json!({"texts": [text], "near": [robot.x, robot.y, 0.0], "limit": LIMIT});
     let mut reply = service.post("/v1/query", &body)?;
     match reply["results"][0]["answers"].take() {
         Value::Array(answers) => Ok(answers),
         // 422: words unknown to the model.
         _ if reply["status"] == 422 => Ok(Vec::new()),
-        _ => Err(anyhow!("{}: {}", question.text, reply["detail"])),
+        _ => Err(anyhow!("{text}: {}", reply["detail"])),
     }
 }
 
@@ -187,20 +175,6 @@ fn iou(a: &Aabb, b: &Aabb) -> f64 {
     let shared = (a.max.min(b.max) - a.min.max(b.min)).max(DVec3::ZERO).element_product();
     let both = a.size().element_product() + b.size().element_product() - shared;
     if both > 0.0 { shared / both } else { 0.0 }
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "kebab-case")]
-enum Way {
-    Relations,
-    /// The phrase as one text, with the scene's threshold.
-    Phrase,
-    /// The noun alone, with the scene's threshold.
-    Noun,
-}
-
-impl Way {
-    const ALL: [Self; 3] = [Self::Relations, Self::Phrase, Self::Noun];
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -231,7 +205,6 @@ struct Row {
     /// `None` for all of them.
     relation: Option<Asked>,
     has_answer: bool,
-    way: Way,
     #[serde(flatten)]
     counts: Counts,
 }
@@ -239,27 +212,21 @@ struct Row {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RelationsReport {
     scenes: Vec<String>,
-    counts: BTreeMap<(Asked, bool, Way), Counts>,
+    /// By relation, and whether a thing is meant.
+    counts: BTreeMap<(Asked, bool), Counts>,
 }
 
 impl RelationsReport {
-    /// Adds what came of a question. `has_answer`: whether a thing is meant.
-    fn count(&mut self, asked: Asked, has_answer: bool, way: Way, counts: Counts) {
-        self.counts.entry((asked, has_answer, way)).or_default().add(counts);
-    }
-
     fn rows(&self) -> Vec<Row> {
-        let row = |relation, has_answer, way, counts| Row { relation, has_answer, way, counts };
-        let each =
-            self.counts.iter().map(|((asked, has, way), counts)| row(Some(*asked), *has, *way, *counts));
-        let total = |(has_answer, way)| {
+        let row = |relation, has_answer, counts| Row { relation, has_answer, counts };
+        let each = self.counts.iter().map(|((asked, has), counts)| row(Some(*asked), *has, *counts));
+        let total = |has_answer| {
             let mut total = Counts::default();
-            let of = self.counts.iter().filter(|((_, has, by), _)| *has == has_answer && *by == way);
+            let of = self.counts.iter().filter(|((_, has), _)| *has == has_answer);
             of.for_each(|(_, counts)| total.add(*counts));
-            row(None, has_answer, way, total)
+            row(None, has_answer, total)
         };
-        let totals = [true, false].into_iter().flat_map(|has| Way::ALL.map(|way| (has, way)));
-        each.chain(totals.map(total)).collect()
+        each.chain([true, false].map(total)).collect()
     }
 }
 
@@ -277,14 +244,13 @@ impl Serialize for RelationsReport {
 impl fmt::Display for RelationsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
-        let columns = ["relation", "answer", "asked as", "questions", "best right", "precision", "recall"];
+        let columns = ["relation", "answer", "questions", "best right", "precision", "recall"];
         let mut table = Table::new(columns);
-        for Row { relation, has_answer, way, counts } in self.rows() {
+        for Row { relation, has_answer, counts } in self.rows() {
             let percent = |n: usize, of: usize| percent(n as u64, of as u64);
             table.row([
                 relation.map_or("all".into(), |relation| format!("{relation:?}")),
                 if has_answer { "some" } else { "none" }.to_owned(),
-                format!("{way:?}"),
                 counts.n_questions.to_string(),
                 percent(counts.n_right, counts.n_questions),
                 percent(counts.n_answers_right, counts.n_answers),
