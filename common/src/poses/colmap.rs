@@ -16,6 +16,8 @@ use super::view_set::{Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::files::{self, NotUtf8};
 
+const UNDISTORT: &str = "run COLMAP's image_undistorter and use its output";
+
 /// Longest image name read from a binary file, bytes: Linux's limit for a path.
 const MAX_NAME_BYTES: u64 = 4096;
 /// Bytes of a 2D feature in `images.bin`: x, y (f64) and a point id (u64).
@@ -141,11 +143,8 @@ fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsi
         }
         _ => {
             let expected = MODELS.iter().find(|(_, name, _)| *name == model).map_or(0, |(.., n)| *n);
-            return Err(PoseProblem::LensParameters {
-                model: model.to_owned(),
-                expected,
-                found: params.len(),
-            });
+            let fault = format!("{model} has {expected} parameters, found {}", params.len());
+            return Err(PoseProblem::new(fault, "export the cameras again"));
         }
     };
     check_intrinsics(size_px, focal, centre, distortion)
@@ -188,12 +187,13 @@ impl Images {
         let (name, is_foreign) = relative(record.name);
         let is_inside = |path: &Path| path.components().all(|c| matches!(c, Component::Normal(_)));
         if name.is_empty() || name.contains('\0') || !is_inside(Path::new(&name)) {
-            return Err(PoseProblem::UnsafeName { image: name }.at(model.path, place));
+            return Err(PoseProblem::unsafe_name(&name).at(model.path, place));
         }
         let Some(intrinsics) = model.cameras.get(&camera_id).copied() else {
-            return Err(PoseProblem::UnknownCamera { image: name, camera_id }.at(model.path, place));
+            let fault = format!("image {name:?} uses camera {camera_id}, which is not in the cameras file");
+            return Err(PoseProblem::new(fault, "export both files together").at(model.path, place));
         };
-        match affine_from_wxyz(&name, wxyz, translation) {
+        match affine_from_wxyz(wxyz, translation) {
             Err(problem) => self.damaged.add(&name, problem, model.path, place),
             Ok(camera_from_world) => {
                 if is_foreign {
@@ -221,7 +221,10 @@ fn relative(name: &str) -> (String, bool) {
 fn insert(cameras: &mut Cameras, camera_id: u32, camera: Intrinsics) -> Result<(), PoseProblem> {
     match cameras.insert(camera_id, camera) {
         None => Ok(()),
-        Some(_) => Err(PoseProblem::DuplicateCamera { camera_id }),
+        Some(_) => {
+            let fault = format!("two cameras have the id {camera_id}");
+            Err(PoseProblem::new(fault, "remove one of them"))
+        }
     }
 }
 
@@ -252,7 +255,7 @@ impl Lines {
             1 => files::text_of(&bytes).map(str::to_owned),
             _ => String::from_utf8(bytes).map_err(|_| NotUtf8::Other),
         };
-        self.line = text.map_err(|fault| self.fail(PoseProblem::NotUtf8(fault)))?;
+        self.line = text.map_err(|fault| self.fail(fault.into()))?;
         Ok(n > 0)
     }
 
@@ -272,7 +275,7 @@ fn take<T: std::str::FromStr>(rest: &mut &str, expected: &'static str) -> Result
     let trimmed = rest.trim_start();
     let (word, after) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
     *rest = after;
-    word.parse().map_err(|_| PoseProblem::Expected { expected, found: excerpt(word) })
+    word.parse().map_err(|_| PoseProblem::expected(expected, excerpt(word)))
 }
 
 fn excerpt(text: &str) -> String {
@@ -302,7 +305,8 @@ fn camera_from_line(line: &str) -> Result<(u32, Intrinsics), PoseProblem> {
     let camera_id = take(&mut rest, "a camera id")?;
     let model: String = take(&mut rest, "a lens model")?;
     if !MODELS.iter().any(|(_, name, _)| *name == model) {
-        return Err(PoseProblem::UnsupportedModel { camera_id, model: excerpt(&model) });
+        let fault = format!("camera {camera_id}: model {} is not supported", excerpt(&model));
+        return Err(PoseProblem::new(fault, UNDISTORT));
     }
     let size_px = take_numbers::<2>(&mut rest, "width and height in pixels")?;
     let mut params = Vec::new();
@@ -368,7 +372,7 @@ impl Binary {
     fn take<const N: usize>(&mut self, expected: &'static str) -> Result<[u8; N], PoseError> {
         let mut bytes = [0; N];
         if self.len_bytes.saturating_sub(self.offset_bytes) < N as u64 {
-            return Err(self.fail(PoseProblem::Truncated { expected }));
+            return Err(self.fail(PoseProblem::truncated(expected)));
         }
         self.reader.read_exact(&mut bytes)?;
         self.offset_bytes += N as u64;
@@ -397,14 +401,12 @@ impl Binary {
         self.reader.by_ref().take(MAX_NAME_BYTES).read_until(0, &mut bytes)?;
         let expected = "an image name of at most 4096 bytes, terminated by a zero byte";
         if bytes.last() != Some(&0) {
-            return Err(self.fail(PoseProblem::Truncated { expected }));
+            return Err(self.fail(PoseProblem::truncated(expected)));
         }
         bytes.pop();
         let name = String::from_utf8(bytes).map_err(|e| {
-            self.fail(PoseProblem::Expected {
-                expected,
-                found: excerpt(&String::from_utf8_lossy(e.as_bytes())),
-            })
+            let found = excerpt(&String::from_utf8_lossy(e.as_bytes()));
+            self.fail(PoseProblem::expected(expected, found))
         })?;
         self.offset_bytes += name.len() as u64 + 1;
         Ok(name)
@@ -420,7 +422,7 @@ impl Binary {
                 self.offset_bytes += bytes;
                 Ok(())
             }
-            _ => Err(self.fail(PoseProblem::Truncated { expected })),
+            _ => Err(self.fail(PoseProblem::truncated(expected))),
         }
     }
 
@@ -429,7 +431,7 @@ impl Binary {
             return Ok(());
         }
         let found = format!("{} more bytes", self.len_bytes.saturating_sub(self.offset_bytes));
-        Err(self.fail(PoseProblem::Expected { expected: "the end of the file", found }))
+        Err(self.fail(PoseProblem::expected("the end of the file", found)))
     }
 }
 
@@ -440,9 +442,8 @@ fn cameras_from_binary(path: &Path) -> Result<Cameras, PoseError> {
         let camera_id = file.u32("a camera id")?;
         let model_id = i32::from_le_bytes(file.take("a lens model's number")?);
         let Some((_, model, n_params)) = MODELS.iter().find(|(id, ..)| *id == model_id) else {
-            return Err(
-                file.fail(PoseProblem::UnsupportedModel { camera_id, model: format!("number {model_id}") })
-            );
+            let fault = format!("camera {camera_id}: model number {model_id} is not supported");
+            return Err(file.fail(PoseProblem::new(fault, UNDISTORT)));
         };
         let size_px = [file.u64("the width")? as f64, file.u64("the height")? as f64];
         let mut params = Vec::new();

@@ -4,7 +4,7 @@
 use std::io::Read;
 
 use serde_json::Value;
-use slag_common::splat::{ReadOptions, SplatError, read};
+use slag_common::splat::{ReadOptions, read};
 
 use super::generated::gzip;
 use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
@@ -162,14 +162,12 @@ fn a_dot_splat_with_an_incomplete_row_is_refused() {
 fn refusals_give_advice() {
     let folder = shared("fixtures/formats");
     let error = read_all(&folder.join("minimal.ksplat")).expect_err("is refused");
-    assert!(matches!(error, SplatError::Unsupported { .. }));
     let text = error.to_string();
     assert!(text.contains("minimal.ksplat: .ksplat is not supported; convert it"), "{text}");
     let error = read_all(&folder.join("README.md")).expect_err("is refused");
     assert!(error.to_string().contains("README.md: byte 0: expected a PLY"), "{error}");
-    let error = read_all(&folder.join("absent.ply")).expect_err("is refused");
-    assert!(matches!(error, SplatError::Io { .. }));
-    assert!(error.to_string().contains("absent.ply"), "{error}");
+    let error = read_all(&folder.join("absent.ply")).expect_err("is refused").to_string();
+    assert!(error.contains("absent.ply") && error.contains("check the path"), "{error}");
 }
 
 #[test]
