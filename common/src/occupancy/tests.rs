@@ -13,8 +13,9 @@ fn written(sections: &[(u32, &[u8])]) -> AlignedBytes {
     AlignedBytes::copy_of(&out)
 }
 
-fn checked(bytes: &AlignedBytes) -> Result<Option<OccupancyLayout>, ContainerError> {
-    OccupancyLayout::check(bytes, &Layout::check(bytes, MAGIC, 1).expect("a container"))
+fn checked(bytes: &AlignedBytes) -> Result<Option<Occupancy<'_>>, ContainerError> {
+    let layout = Layout::check(bytes, MAGIC, 1).expect("a container");
+    check(bytes, &layout).map(|()| Occupancy::of(bytes, &layout))
 }
 
 fn blocks(random: &mut Random, n: i32) -> Vec<Block> {
@@ -54,8 +55,7 @@ fn every_voxel_comes_back() {
         }
         let built = BuiltOccupancy::pack(0.05, 0.1, 2, &blocks);
         let bytes = written(&built.view().sections());
-        let layout = checked(&bytes).expect("valid").expect("there");
-        let view = layout.view(&bytes);
+        let view = checked(&bytes).expect("valid").expect("there");
         assert_eq!((view.header.voxel, view.header.min_opacity, view.header.min_views), (0.05, 0.1, 2));
         let reach = 4 * n + 5;
         for voxel in (-reach..reach)
