@@ -30,6 +30,24 @@ fn refused(result: Result<ViewSet, PoseError>, parts: &[&str]) {
     assert!(parts.iter().all(|part| error.contains(part)), "{error}, expected {parts:?}");
 }
 
+/// `cameras.bin` with one camera of 64 x 48 pixels; `model`: COLMAP's number.
+fn camera_bytes(id: u32, model: i32, params: &[f64]) -> Vec<u8> {
+    let mut out = [&1_u64.to_le_bytes()[..], &id.to_le_bytes(), &model.to_le_bytes()].concat();
+    out.extend([64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat());
+    out.extend(params.iter().flat_map(|p| p.to_le_bytes()));
+    out
+}
+
+/// A record of `images.bin`, up to its 2D features. `pose`: QW QX QY QZ TX TY TZ.
+fn image_bytes(pose: [f64; 7], camera_id: u32, name: &str, n_features: u64) -> Vec<u8> {
+    let mut out = 3_u32.to_le_bytes().to_vec();
+    out.extend(pose.iter().flat_map(|v| v.to_le_bytes()));
+    out.extend(camera_id.to_le_bytes());
+    out.extend([name.as_bytes(), b"\0"].concat());
+    out.extend(n_features.to_le_bytes());
+    out
+}
+
 /// Oracle: camera centres in geo.json (`cam_enu`), computed by another program and rounded to a millimetre.
 #[needs_shared]
 #[test]
@@ -129,17 +147,9 @@ fn lens_models() {
             "3 1 0 0 0 1 2 3 7 with space/a b.jpg\n\n",
         );
 
-        let mut cameras = 1_u64.to_le_bytes().to_vec();
-        cameras.extend([7_u32.to_le_bytes(), number.to_le_bytes()].concat());
-        cameras.extend([64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat());
-        cameras.extend(params.iter().flat_map(|p| p.to_le_bytes()));
-        let mut images = 1_u64.to_le_bytes().to_vec();
-        images.extend(3_u32.to_le_bytes());
-        images.extend([1.0_f64, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes()));
-        images.extend(7_u32.to_le_bytes());
-        images.extend(b"with space/a b.jpg\0");
-        images.extend(2_u64.to_le_bytes());
-        images.extend([0xFF; 48]);
+        let cameras = camera_bytes(7, number, params);
+        let image = image_bytes([1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0], 7, "with space/a b.jpg", 2);
+        let images = [&1_u64.to_le_bytes()[..], &image, &[0xFF; 48]].concat();
         let binary = read_files(&[("sparse/cameras.bin", &cameras), ("sparse/images.bin", &images)]);
 
         for set in [text.unwrap(), binary.unwrap()] {
@@ -228,14 +238,10 @@ fn frames_without_a_valid_pose_are_left_out() {
     ] {
         let text = read_text(CAMERA, &format!("1 {good} 1 a.jpg\n\n2 {bad} 1 b.jpg\n\n")).unwrap();
         let record = |name: &str, pose: &str| {
-            let numbers = pose.split(' ').flat_map(|v| v.parse::<f64>().unwrap().to_le_bytes());
-            let head = 1_u32.to_le_bytes().into_iter().chain(numbers).chain(1_u32.to_le_bytes());
-            head.chain(name.bytes()).chain([0; 9]).collect::<Vec<u8>>()
+            let numbers: Vec<f64> = pose.split(' ').map(|v| v.parse().unwrap()).collect();
+            image_bytes(numbers.try_into().unwrap(), 1, name, 0)
         };
-        let mut cameras = [1_u64.to_le_bytes().to_vec(), 1_u32.to_le_bytes().to_vec()].concat();
-        cameras.extend(0_i32.to_le_bytes());
-        cameras.extend([64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat());
-        cameras.extend([50.0_f64, 32.0, 24.0].iter().flat_map(|v| v.to_le_bytes()));
+        let cameras = camera_bytes(1, 0, &[50.0, 32.0, 24.0]);
         let images = [2_u64.to_le_bytes().to_vec(), record("a.jpg", good), record("b.jpg", bad)].concat();
         let binary = read_files(&[("cameras.bin", &cameras), ("images.bin", &images)]).unwrap();
         for set in [text, binary] {
@@ -396,15 +402,10 @@ fn transforms_of_other_programs_are_read() {
 /// Counts of 2D features beyond the file's end, by one record and by overflow.
 #[test]
 fn counts_are_not_trusted() {
-    let camera = [&1_u64.to_le_bytes()[..], &1_u32.to_le_bytes(), &0_i32.to_le_bytes()].concat();
-    let sizes = [64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat();
-    let params: Vec<u8> = [50.0_f64, 32.0, 24.0].iter().flat_map(|v| v.to_le_bytes()).collect();
-    let cameras = [camera, sizes, params].concat();
+    let cameras = camera_bytes(1, 0, &[50.0, 32.0, 24.0]);
     for n_features in [2, u64::MAX / 24, u64::MAX] {
-        let pose = [1.0_f64, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes());
-        let mut images = [&1_u64.to_le_bytes()[..], &3_u32.to_le_bytes()].concat();
-        images.extend(pose.chain(1_u32.to_le_bytes()).chain(*b"a.jpg\0").chain(u64::to_le_bytes(n_features)));
-        images.extend([0; 24]);
+        let image = image_bytes([1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0], 1, "a.jpg", n_features);
+        let images = [&1_u64.to_le_bytes()[..], &image, &[0; 24]].concat();
         let place = format!("images.bin: byte {}: ", 8 + 4 + 56 + 4 + 6 + 8);
         let read = read_files(&[("cameras.bin", &cameras), ("images.bin", &images)]);
         refused(read, &[&place, "ends before the image's 2D features"]);

@@ -29,8 +29,6 @@ pub(super) struct Names {
 #[derive(Debug)]
 pub(super) struct Link {
     pub(super) output: String,
-    /// Declared shape of the output; -1 is any size.
-    pub(super) shape: Vec<i64>,
     pub(super) input: String,
 }
 
@@ -51,12 +49,8 @@ impl Inputs {
         for (name, tensor) in declared(decoder.session.inputs()) {
             let given = offered.iter().find(|(output, _)| *output == name);
             match (given, tensor) {
-                (Some((output, Some((Float32, shape)))), Some((Float32, _))) => {
-                    inputs.embeddings.push(Link {
-                        output: output.clone(),
-                        shape: shape.clone(),
-                        input: name,
-                    });
+                (Some((output, Some((Float32, _)))), Some((Float32, _))) => {
+                    inputs.embeddings.push(Link { output: output.clone(), input: name });
                 }
                 (_, Some((Float32, shape))) if matches!(shape[..], [_, _, _, 2]) => {
                     inputs.is_one_by_one = shape[1] == 1;
@@ -68,11 +62,11 @@ impl Inputs {
             }
         }
         // Some exports name a single embedding differently on both sides.
-        if let ([_], [(output, Some((Float32, shape)))], true) =
+        if let ([_], [(output, Some((Float32, _)))], true) =
             (&inputs.others[..], offered, inputs.embeddings.is_empty())
         {
             let input = inputs.others.swap_remove(0);
-            inputs.embeddings.push(Link { output: output.clone(), shape: shape.clone(), input });
+            inputs.embeddings.push(Link { output: output.clone(), input });
         }
         inputs
     }

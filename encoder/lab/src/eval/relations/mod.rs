@@ -20,7 +20,7 @@ use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
-use truth::Asked;
+use truth::{RELATIONS, Relation};
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
@@ -50,14 +50,14 @@ pub(crate) struct RelationsArgs {
 }
 
 struct Question {
-    asked: Asked,
+    relation: &'static Relation,
     text: String,
     /// Indices of the things meant; empty if there is none.
     truth: Vec<usize>,
 }
 
 pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<RelationsReport> {
-    let mut report = RelationsReport::default();
+    let mut counts = BTreeMap::new();
     let scenes = Prepared {
         out: &args.out,
         kinds: &args.kind,
@@ -66,15 +66,25 @@ pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<Relat
         walk: Walk::Oval,
         encode_flags: &[],
     };
-    report.scenes = scenes.judge(progress, |_, _, dir| judge(dir, &mut report))?;
-    Ok(report)
+    let scenes = scenes.judge(progress, |_, _, dir| judge(dir, &mut counts))?;
+    let row = |relation, has_answer, counts| Row { relation, has_answer, counts };
+    let mut rows: Vec<Row> = counts.iter().map(|((relation, has), of)| row(*relation, *has, *of)).collect();
+    for has_answer in [true, false] {
+        let mut total = Counts::default();
+        counts.iter().filter(|((_, has), _)| *has == has_answer).for_each(|(_, counts)| total.add(*counts));
+        rows.push(row("all", has_answer, total));
+    }
+    Ok(RelationsReport { scenes, rows })
 }
 
-fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
+/// By relation, and whether a thing is meant.
+type AllCounts = BTreeMap<(&'static str, bool), Counts>;
+
+fn judge(dir: &Path, all: &mut AllCounts) -> Result<()> {
     let (things, _) = read_things(&dir.join("scene"))?;
     let robot = middle(&things);
     let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
-    for Question { asked, text, truth } in questions(&things, robot) {
+    for Question { relation, text, truth } in questions(&things, robot) {
         let answered = ask(&service, &text, robot)?;
         let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
         let is_right = |at: &Option<usize>| at.is_some_and(|at| truth.contains(&at));
@@ -87,7 +97,7 @@ fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
             n_meant: truth.len(),
             n_meant_found: distinct.iter().filter(|at| truth.contains(at)).count(),
         };
-        report.counts.entry((asked, !truth.is_empty())).or_default().add(counts);
+        all.entry((relation.text, !truth.is_empty())).or_default().add(counts);
     }
     Ok(())
 }
@@ -113,7 +123,7 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     let several = n_of_kind.into_iter().filter(|(_, n)| *n > 1).map(|(kind, _)| kind);
     let ones: Vec<&str> = nouns.iter().copied().chain(several).collect();
     let mut all = Vec::new();
-    for asked in Asked::ALL {
+    for relation in &RELATIONS {
         let mut of_relation: [Vec<Question>; 2] = [Vec::new(), Vec::new()];
         for thing in &ones {
             for of in nouns.iter().filter(|of| *of != thing) {
@@ -123,14 +133,14 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
                 if n_of != 1 || things.iter().any(is_part) {
                     continue;
                 }
-                let truth = truth::meant(things, asked, thing, of, robot);
+                let truth = relation.meant(things, thing, of, robot);
                 // The thing that a picked one is compared with must be visible.
                 if truth.iter().any(|at| things[*at].train_pixels < MIN_PIXELS) {
                     continue;
                 }
-                let text = asked.text(thing, of);
+                let text = relation.question(thing, of);
                 let has_answer = usize::from(!truth.is_empty());
-                of_relation[has_answer].push(Question { asked, text, truth });
+                of_relation[has_answer].push(Question { relation, text, truth });
             }
         }
         for questions in of_relation {
@@ -202,43 +212,17 @@ impl Counts {
 
 #[derive(Clone, Debug, Serialize)]
 struct Row {
-    /// `None` for all of them.
-    relation: Option<Asked>,
+    /// Its question, or `all`.
+    relation: &'static str,
     has_answer: bool,
     #[serde(flatten)]
     counts: Counts,
 }
 
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Serialize)]
 pub(crate) struct RelationsReport {
     scenes: Vec<String>,
-    /// By relation, and whether a thing is meant.
-    counts: BTreeMap<(Asked, bool), Counts>,
-}
-
-impl RelationsReport {
-    fn rows(&self) -> Vec<Row> {
-        let row = |relation, has_answer, counts| Row { relation, has_answer, counts };
-        let each = self.counts.iter().map(|((asked, has), counts)| row(Some(*asked), *has, *counts));
-        let total = |has_answer| {
-            let mut total = Counts::default();
-            let of = self.counts.iter().filter(|((_, has), _)| *has == has_answer);
-            of.for_each(|(_, counts)| total.add(*counts));
-            row(None, has_answer, total)
-        };
-        each.chain([true, false].map(total)).collect()
-    }
-}
-
-impl Serialize for RelationsReport {
-    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
-        #[derive(Serialize)]
-        struct Report<'a> {
-            scenes: &'a [String],
-            rows: Vec<Row>,
-        }
-        Report { scenes: &self.scenes, rows: self.rows() }.serialize(to)
-    }
+    rows: Vec<Row>,
 }
 
 impl fmt::Display for RelationsReport {
@@ -246,11 +230,11 @@ impl fmt::Display for RelationsReport {
         writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
         let columns = ["relation", "answer", "questions", "best right", "precision", "recall"];
         let mut table = Table::new(columns);
-        for Row { relation, has_answer, counts } in self.rows() {
+        for Row { relation, has_answer, counts } in &self.rows {
             let percent = |n: usize, of: usize| percent(n as u64, of as u64);
             table.row([
-                relation.map_or("all".into(), |relation| format!("{relation:?}")),
-                if has_answer { "some" } else { "none" }.to_owned(),
+                (*relation).to_owned(),
+                if *has_answer { "some" } else { "none" }.to_owned(),
                 counts.n_questions.to_string(),
                 percent(counts.n_right, counts.n_questions),
                 percent(counts.n_answers_right, counts.n_answers),
