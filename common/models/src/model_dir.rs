@@ -67,10 +67,10 @@ impl Files {
         let mut hashed = self.description.clone();
         let root = self.root.as_deref().unwrap_or(Path::new(""));
         for file in hashed.files_mut() {
-            file.for_each_part(|part| {
-                part.sha256 = Some(description::Sha256(sha256_of(root, part)?));
-                Ok::<_, ModelError>(())
-            })?;
+            file.sha256 = Some(description::Sha256(sha256_of(root, file)?));
+            if let Some(data) = &mut file.data {
+                data.sha256 = Some(description::Sha256(sha256_of(root, data)?));
+            }
         }
         Ok(hashed)
     }

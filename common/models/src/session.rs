@@ -318,21 +318,10 @@ impl Model {
         name: &str,
         shape: &[i64],
     ) -> Result<Vec<f32>, ModelError> {
-        Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values.into_vec())
-    }
-
-    /// Runs the model; returns f32 outputs in the given order; -1 in a shape is any size.
-    pub(crate) fn run_all(
-        &mut self,
-        inputs: Vec<(&str, SessionInputValue<'_>)>,
-        outputs: &[(&str, &[i64])],
-    ) -> Result<Vec<Tensor>, ModelError> {
         let tensor = |value: DynValue| value.downcast::<DynTensorValueType>().ok();
-        let values = self.session.run(inputs).map(|mut found| {
-            outputs.iter().map(|(name, _)| found.remove(name).and_then(tensor)).collect::<Vec<_>>()
-        });
-        let values = values.map_err(|cause| self.run_error(cause))?.into_iter();
-        values.zip(outputs).map(|(value, (name, shape))| self.floats(value, name, shape)).collect()
+        let found = self.session.run(inputs).map(|mut found| found.remove(name).and_then(tensor));
+        let found = found.map_err(|cause| self.run_error(cause))?;
+        Ok(self.floats(found, name, shape)?.values.into_vec())
     }
 
     /// Values of output `name`, f32 or f16, which must fit `shape`; -1 is any size.

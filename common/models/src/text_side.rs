@@ -8,18 +8,8 @@ use crate::file_ref::ModelFile;
 use crate::{EncoderId, ModelError};
 
 /// Licences that permit redistribution of weights, by SPDX name.
-const REDISTRIBUTABLE: [&str; 10] = [
-    "Apache-2.0",
-    "BSD-2-Clause",
-    "BSD-3-Clause",
-    "BSL-1.0",
-    "CC-BY-4.0",
-    "CC0-1.0",
-    "ISC",
-    "MIT",
-    "Unlicense",
-    "Zlib",
-];
+const REDISTRIBUTABLE: &str =
+    "Apache-2.0, BSD-2-Clause, BSD-3-Clause, BSL-1.0, CC-BY-4.0, CC0-1.0, ISC, MIT, Unlicense, Zlib";
 
 /// Why a store cannot carry a model's text side.
 #[derive(Debug, thiserror::Error)]
@@ -68,7 +58,10 @@ fn pointer(role: &str) -> &'static str {
 
 /// Whether a licence expression is known to permit redistribution: every part joined by AND, or any joined by OR.
 fn may_be_passed_on(licence: &str) -> bool {
-    let is_known = |name: &str| REDISTRIBUTABLE.contains(&name.trim_matches(['(', ')', ' ']));
+    let is_known = |name: &str| {
+        let name = name.trim_matches(['(', ')', ' ']);
+        REDISTRIBUTABLE.split(", ").any(|known| known == name)
+    };
     licence.split(" OR ").any(|part| part.split(" AND ").all(is_known))
 }
 
@@ -84,9 +77,9 @@ impl TextSide {
         let (model, licence) = (&hashed.name, &hashed.licence);
         if !may_be_passed_on(licence) {
             return Err(TextSideError(format!(
-                "the licence of {model} is {licence:?}, which is not known to permit passing its weights on ({}); pull \
-                 the model on each robot with `slag-edge models pull`, or correct `licence` in model.toml",
-                REDISTRIBUTABLE.join(", ")
+                "the licence of {model} is {licence:?}, which is not known to permit passing its weights on \
+                 ({REDISTRIBUTABLE}); pull the model on each robot with `slag-edge models pull`, or correct `licence` in \
+                 model.toml"
             )));
         }
         let other = |what: String| TextSideError::unlike(model, what);

@@ -86,9 +86,9 @@ impl fmt::Display for DefaultsReport {
         for row in &self.rows {
             let mut cells = vec![row.scene.clone(), row.masks.name().to_owned()];
             let report = &row.report;
-            let miou = report.multi_class.first().and_then(|all| all.miou);
             cells.extend([row.method.to_owned(), report.kind.to_string()]);
-            cells.extend([miou, report.mean_average_precision, report.mean_area_under_roc].map(figure));
+            cells
+                .extend([report.miou, report.mean_average_precision, report.mean_area_under_roc].map(figure));
             if let Some(found) = &report.instances {
                 let InstanceReport { any, n_merged_objects, n_objects, n_in_objects, n_split_things, .. } =
                     found;

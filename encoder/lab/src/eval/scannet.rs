@@ -21,7 +21,6 @@ use slag_encoder::query;
 use slag_encoder::store::StoreReader;
 use slag_models::TextEncoder;
 
-use super::judge::Subset;
 use super::metrics::{Confusion, mean};
 use super::truth::check_scene;
 use crate::table::{Table, figure};
@@ -68,6 +67,14 @@ pub(crate) struct ScannetArgs {
     /// take its most frequent class.
     #[arg(long)]
     segments: bool,
+}
+
+/// Means over a list of classes.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Subset {
+    pub(super) n_classes: usize,
+    pub(super) miou: Option<f64>,
+    pub(super) macc: Option<f64>,
 }
 
 #[derive(Clone, Debug, Serialize)]

@@ -105,7 +105,7 @@ fn figures(
     let figures = Figures {
         n_views: Some(n_views as f64),
         ap: of_gaussians.mean_average_precision,
-        miou: of_gaussians.multi_class.first().and_then(|all| all.miou),
+        miou: of_gaussians.miou,
         found: any.map(|any| any.n_at_50 as f64),
         n_things: any.map(|any| any.n as f64),
     };

@@ -136,7 +136,6 @@ impl Run<'_> {
         let of_views = *views_seconds.get_or_insert(own_views);
         let judged = self.evaluate()?;
         let n_gaussians = figure(&encoded, "n_gaussians")?.max(1.0);
-        let all = &judged["multi_class"][0];
         Ok(Ok(Figures {
             scene: self.scene.name.clone(),
             point: point.clone(),
@@ -145,8 +144,8 @@ impl Run<'_> {
             n_photos: integer(&encoded, "n_views_with_photo"),
             n_gaussians: n_gaussians as u64,
             n_masks: integer(&encoded, "n_masks"),
-            miou: figure(all, "miou")?,
-            macc: figure(all, "macc")?,
+            miou: figure(&judged, "miou")?,
+            macc: figure(&judged, "macc")?,
             map: judged["mean_average_precision"].as_f64(),
             auc: judged["mean_area_under_roc"].as_f64(),
             n_unknown_words: judged["unknown_words"].as_object().map_or(0, |words| words.len() as u64),

@@ -17,7 +17,7 @@ use slag_encoder::cli::common::session_options;
 use slag_encoder::encode::DEFAULT_MASK_LEVELS;
 use slag_encoder::ingest;
 use slag_encoder::masks::{Mask, NO_REGION, regions};
-use slag_encoder::progress::{Progress, Silent};
+use slag_encoder::progress::Progress;
 use slag_encoder::raster::devices::{DeviceChoice, Devices};
 use slag_encoder::raster::gpu::GpuOptions;
 use slag_encoder::raster::{LoadedScene, RasterView, Rasterizer};
@@ -29,32 +29,19 @@ use slag_models::commands::RunArgs;
 
 use super::metrics::mean;
 use super::truth::read_things;
-use crate::generate::Scene;
-use crate::generate::grammar::SceneKind;
-use crate::programs::flag_value;
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure, percent};
-use segments::{Ious, MIN_PX, Segments};
+use segments::{Ious, MIN_PX};
 
 /// Opacity from which a pixel has splat behind it.
 const MIN_COVERAGE: f32 = 0.5;
-const N_GENERATED_VIEWS: u32 = 24;
 
 /// `eval masks`.
 #[derive(Debug, Args)]
 pub(crate) struct MasksArgs {
     /// Scenes: a splat, poses and photos; gt/masks and gt/instances.json where there are labels.
-    #[arg(long, value_name = "DIR", num_args = 1..)]
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
-    /// Kinds of scenes to generate and judge as well.
-    #[arg(long, value_enum, value_delimiter = ',')]
-    kind: Vec<SceneKind>,
-    /// Seeds of each kind.
-    #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [31, 32])]
-    seeds: Vec<u64>,
-    /// Folder for generated scenes; what an earlier run left there is used.
-    #[arg(long, value_name = "DIR", default_value = "target/masks")]
-    out: PathBuf,
     /// Segmenters: auto (the built-in one), graph (it without its model), or the folder of a Segment Anything
     /// model.
     #[arg(long, value_name = "auto|graph|DIR,...", value_delimiter = ',', default_value = "auto")]
@@ -79,8 +66,8 @@ struct Row {
     /// Pixels with splat behind them, and those of them in a mask.
     n_seen_px: u64,
     n_covered_px: u64,
-    /// Absent without labels.
-    segments: Option<Segments>,
+    /// How well the masks find labelled things; absent without labels.
+    things: Option<Ious>,
     /// Seconds of the segmenter a photo.
     secs: f64,
 }
@@ -93,15 +80,8 @@ pub(crate) struct MasksReport {
 pub(crate) fn run(args: &MasksArgs, progress: &dyn Progress) -> Result<MasksReport> {
     let session = session_options(&args.how)?;
     let devices = Devices::open(&args.device, GpuOptions::default())?;
-    let mut dirs = args.scene.clone();
-    for (kind, seed) in args.kind.iter().flat_map(|kind| args.seeds.iter().map(move |seed| (kind, *seed))) {
-        dirs.push(generated(*kind, seed, &args.out)?);
-    }
-    if dirs.is_empty() {
-        bail!("nothing to judge; give --scene or --kind");
-    }
     let mut rows = Vec::new();
-    for files in SceneFiles::find_all(&dirs)? {
+    for files in SceneFiles::find_all(&args.scene)? {
         let gaussians = splat::read(&files.splat, &ReadOptions { with_sh_rest: false })?;
         let scene = devices.load(&gaussians)?;
         let all = poses::read(&files.poses, files.images.as_deref())?.views;
@@ -111,7 +91,10 @@ pub(crate) fn run(args: &MasksArgs, progress: &dyn Progress) -> Result<MasksRepo
             progress.begin(&format!("{} {}", files.name, name.display()), "photo", n as u64, 0);
             let mut row = Row::new(&files, name);
             let labels = match &files.true_masks {
-                Some(dir) => Some(Labels::read(&files.dir, dir)?),
+                Some(masks) => {
+                    let (things, _) = read_things(&files.dir)?;
+                    Some(Labels { masks, things: things.iter().map(|thing| thing.id).collect() })
+                }
                 None => None,
             };
             for view in (0..n).map(|i| &all[i * all.len() / n]) {
@@ -125,14 +108,6 @@ pub(crate) fn run(args: &MasksArgs, progress: &dyn Progress) -> Result<MasksRepo
         }
     }
     Ok(MasksReport { rows })
-}
-
-fn generated(kind: SceneKind, seed: u64, out: &Path) -> Result<PathBuf> {
-    let dir = out.join(format!("{}-{seed}", flag_value(&kind)?));
-    if !dir.join("transforms.json").is_file() {
-        Scene::new(&[kind], seed, N_GENERATED_VIEWS).write(&dir, &Silent)?;
-    }
-    Ok(dir)
 }
 
 fn open(name: &Path, session: &SessionOptions) -> Result<Box<dyn Segmenter>> {
@@ -149,23 +124,13 @@ fn open(name: &Path, session: &SessionOptions) -> Result<Box<dyn Segmenter>> {
 struct Labels<'a> {
     masks: &'a Path,
     things: BTreeSet<u16>,
-    /// Things and background.
-    known: BTreeSet<u16>,
-}
-
-impl<'a> Labels<'a> {
-    fn read(scene: &Path, masks: &'a Path) -> Result<Self> {
-        let (things, background) = read_things(scene)?;
-        let known = things.iter().chain(&background).map(|thing| thing.id).collect();
-        Ok(Self { masks, things: things.iter().map(|thing| thing.id).collect(), known })
-    }
 }
 
 impl Row {
     fn new(files: &SceneFiles, segmenter: &Path) -> Self {
         let segmenter = segmenter.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let segments = files.true_masks.is_some().then(Segments::default);
-        Self { scene: files.name.clone(), segmenter, segments, ..Self::default() }
+        let things = files.true_masks.is_some().then(Ious::default);
+        Self { scene: files.name.clone(), segmenter, things, ..Self::default() }
     }
 
     fn add(
@@ -195,9 +160,9 @@ impl Row {
             self.n_seen_px += 1;
             self.n_covered_px += u64::from(*region != NO_REGION);
         }
-        if let (Some(labels), Some(segments)) = (labels, &mut self.segments) {
+        if let (Some(labels), Some(things)) = (labels, &mut self.things) {
             let ids = true_ids(labels.masks, view, [width, height])?;
-            segments.add(&regions, &masks_of_region, &ids, &labels.known, &labels.things);
+            things.add(&regions, &masks_of_region, &ids, &labels.things);
         }
         Ok(())
     }
@@ -236,31 +201,19 @@ impl fmt::Display for MasksReport {
             f,
             "Masks of at least {MIN_PX} pixels; covered of the pixels with splat behind them.\n\n{table}"
         )?;
-        let columns =
-            ["scene", "segmenter", "segments", "mean IoU", "found at 0.5", "small / medium / large"];
-        let mut table = Table::new(columns.into_iter().chain(["background found"]));
-        let labelled: Vec<(&Row, &Segments)> =
-            self.rows.iter().filter_map(|row| Some((row, row.segments.as_ref()?))).collect();
-        for (row, segments) in &labelled {
-            let all = segments.things();
-            table.row([
-                row.scene.clone(),
-                row.segmenter.clone(),
-                all.n.to_string(),
-                figure(all.mean()),
-                all.found(),
-                segments.by_size.each_ref().map(Ious::found).join(" / "),
-                segments.background.found(),
-            ]);
+        let mut table = Table::new(["scene", "segmenter", "segments", "mean IoU", "found at 0.5"]);
+        let labelled: Vec<(&Row, &Ious)> =
+            self.rows.iter().filter_map(|row| Some((row, row.things.as_ref()?))).collect();
+        for (row, things) in &labelled {
+            let found = percent(things.n_above_half as u64, things.n as u64);
+            let figures = [things.n.to_string(), figure(things.mean()), found];
+            table.row([row.scene.clone(), row.segmenter.clone()].into_iter().chain(figures));
         }
         if labelled.is_empty() {
             return Ok(());
         }
-        writeln!(
-            f,
-            "Labelled things: the best IoU of a mask; small below 32x32 pixels, large from 96x96.\n\n{table}"
-        )?;
-        let all = mean(labelled.iter().map(|(_, segments)| segments.things().mean()));
+        writeln!(f, "Labelled things: the best IoU of a mask.\n\n{table}")?;
+        let all = mean(labelled.iter().map(|(_, things)| things.mean()));
         writeln!(f, "mean IoU over scenes and segmenters: {}", figure(all))
     }
 }

@@ -5,42 +5,33 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 use slag_encoder::masks::{NO_REGION, RegionMap};
 
-use crate::table::percent;
+/// Smaller masks and segments do not count, as in `encode`.
+pub(super) const MIN_PX: u32 = 200;
 
-/// Areas below which a segment is small, and from which it is large (COCO).
-const SMALL_PX: u64 = 32 * 32;
-const LARGE_PX: u64 = 96 * 96;
-/// How well masks find labelled segments.
+/// The best masks' intersections over union of labelled segments.
 #[derive(Clone, Debug, Default, Serialize)]
-pub(super) struct Segments {
-    /// Things: small, medium, large ones.
-    pub(super) by_size: [Ious; 3],
-    pub(super) background: Ious,
+pub(super) struct Ious {
+    pub(super) n: usize,
+    pub(super) sum: f64,
+    pub(super) n_above_half: usize,
 }
 
-impl Segments {
-    pub(super) fn things(&self) -> Ious {
-        let mut all = Ious::default();
-        for of_size in &self.by_size {
-            all.n += of_size.n;
-            all.sum += of_size.sum;
-            all.n_above_half += of_size.n_above_half;
-        }
-        all
+impl Ious {
+    pub(super) fn mean(&self) -> Option<f64> {
+        (self.n > 0).then(|| self.sum / self.n as f64)
     }
 
-    /// Adds a photo: its masks, each pixel's id, the labelled ids, and those of them that are things.
+    /// Adds a photo: its masks, each pixel's id, and the ids of labelled things.
     pub(super) fn add(
         &mut self,
         regions: &RegionMap,
         masks_of_region: &[Vec<u32>],
         ids: &[u16],
-        known: &BTreeSet<u16>,
         things: &BTreeSet<u16>,
     ) {
         let mut n_of_id: BTreeMap<u16, u64> = BTreeMap::new();
         let mut n_of_both: BTreeMap<(u16, u32), u64> = BTreeMap::new();
-        for (id, region) in ids.iter().zip(&regions.region_of_pixel).filter(|(id, _)| known.contains(id)) {
+        for (id, region) in ids.iter().zip(&regions.region_of_pixel).filter(|(id, _)| things.contains(id)) {
             *n_of_id.entry(*id).or_default() += 1;
             *n_of_both.entry((*id, *region)).or_default() += 1;
         }
@@ -57,37 +48,10 @@ impl Segments {
             }
             let iou = |(mask, both): (&u32, &u64)| *both as f64 / (area + area_of_mask[mask] - both) as f64;
             let best = n_of_mask.iter().map(iou).fold(0.0, f64::max);
-            let size = usize::from(area >= SMALL_PX) + usize::from(area >= LARGE_PX);
-            let of = if things.contains(&id) { &mut self.by_size[size] } else { &mut self.background };
-            of.add(best);
+            self.n += 1;
+            self.sum += best;
+            self.n_above_half += usize::from(best >= 0.5);
         }
-    }
-}
-
-/// Smaller masks and segments do not count, as in `encode`.
-pub(super) const MIN_PX: u32 = 200;
-
-/// The best masks' intersections over union of some segments.
-#[derive(Clone, Debug, Default, Serialize)]
-pub(super) struct Ious {
-    pub(super) n: usize,
-    pub(super) sum: f64,
-    pub(super) n_above_half: usize,
-}
-
-impl Ious {
-    pub(super) fn add(&mut self, iou: f64) {
-        self.n += 1;
-        self.sum += iou;
-        self.n_above_half += usize::from(iou >= 0.5);
-    }
-
-    pub(super) fn mean(&self) -> Option<f64> {
-        (self.n > 0).then(|| self.sum / self.n as f64)
-    }
-
-    pub(super) fn found(&self) -> String {
-        percent(self.n_above_half as u64, self.n as u64)
     }
 }
 
@@ -103,7 +67,7 @@ mod tests {
     }
 
     /// By hand, on 100 x 40 pixels in columns of 20: thing 1 is a mask's; thing 2 is two masks'; thing 3 is half
-    /// of a mask with background 4; thing 5 has no mask.
+    /// of a mask with the background, 4; thing 5 has no mask.
     #[test]
     fn segments_have_a_best_mask() {
         let ids: Vec<u16> = (0..4000).map(|i| [1, 2, 3, 4, 5][i % 100 / 20]).collect();
@@ -114,14 +78,10 @@ mod tests {
             rectangle(40, 0, 75, 40),
         ];
         let (regions, masks_of_region) = partition(&masks, 100, 40, 100, 40, None);
-        let mut segments = Segments::default();
-        let (known, things) = (BTreeSet::from([1, 2, 3, 4, 5]), BTreeSet::from([1, 2, 3, 5]));
-        segments.add(&regions, &masks_of_region, &ids, &known, &things);
-        let all = segments.things();
-        assert_eq!((all.n, segments.by_size[0].n, segments.background.n), (4, 4, 1));
-        // Thing 3: 800 of 1400 pixels; thing 2: 360 of 800; background: 600 of 1400 + 200.
+        let mut found = Ious::default();
+        found.add(&regions, &masks_of_region, &ids, &BTreeSet::from([1, 2, 3, 5]));
+        // Thing 3: 800 of 1400 pixels; thing 2: 360 of 800.
         let expected = 1.0 + 800.0 / 1400.0 + 360.0 / 800.0;
-        assert!((all.sum - expected).abs() < 1e-12 && all.n_above_half == 2, "{all:?}");
-        assert!((segments.background.sum - 600.0 / 1600.0).abs() < 1e-12);
+        assert!((found.sum - expected).abs() < 1e-12 && (found.n, found.n_above_half) == (4, 2), "{found:?}");
     }
 }
