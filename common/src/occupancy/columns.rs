@@ -38,15 +38,6 @@ pub struct OccupancyHeader {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum VoxelState {
-    /// Nothing: no view has looked there.
-    Unknown,
-    /// Views have looked through it, and nothing is there.
-    Free,
-    Occupied,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunKind {
     Free = 1,
     Occupied = 2,
@@ -141,37 +132,6 @@ impl<'a> Occupancy<'a> {
         let (x, y, z) = (index / n_z / n_y, index / n_z % n_y, index % n_z);
         let first = self.header.first_block;
         [first[0] + x as i32, first[1] + y as i32, first[2] + z as i32]
-    }
-}
-
-/// `voxel`: 0..4 each.
-pub(super) fn state_of(masks: [u64; 2], [x, y, z]: [i32; 3]) -> VoxelState {
-    let bit = 1u64 << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x));
-    match (masks[0] & bit != 0, masks[1] & bit != 0) {
-        (true, _) => VoxelState::Occupied,
-        (false, true) => VoxelState::Free,
-        (false, false) => VoxelState::Unknown,
-    }
-}
-
-impl Occupancy<'_> {
-    /// Returns the state of a voxel of the scene's lattice. Scans the runs: for tests and evaluation, not for maps.
-    pub fn state(&self, voxel: [i32; 3]) -> VoxelState {
-        let block = voxel.map(|v| v.div_euclid(BLOCK_EDGE));
-        let of_run = |run: BlockRun<'_>| {
-            let index = self.index_of(block).filter(|index| run.blocks.contains(index))?;
-            Some(state_of(run.masks_of(index), voxel.map(|v| v.rem_euclid(BLOCK_EDGE))))
-        };
-        self.runs().find_map(of_run).unwrap_or(VoxelState::Unknown)
-    }
-
-    fn index_of(&self, block: [i32; 3]) -> Option<u32> {
-        let OccupancyHeader { first_block, n_blocks, .. } = self.header;
-        let at = |axis: usize| {
-            let offset = u32::try_from(block[axis].checked_sub(first_block[axis])?).ok()?;
-            (offset < n_blocks[axis]).then_some(offset)
-        };
-        Some(at(2)? + n_blocks[2] * (at(1)? + n_blocks[1] * at(0)?))
     }
 }
 

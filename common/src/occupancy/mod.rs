@@ -11,6 +11,5 @@ mod tests;
 
 pub(crate) use columns::check;
 pub use columns::{
-    BLOCK_EDGE, Block, BlockRun, BuiltOccupancy, Occupancy, OccupancyHeader, RunKind, StoredRun, VoxelState,
-    section,
+    BLOCK_EDGE, Block, BlockRun, BuiltOccupancy, Occupancy, OccupancyHeader, RunKind, StoredRun, section,
 };

@@ -117,8 +117,8 @@ impl Shape {
     }
 
     /// Surface included.
-    #[cfg(any(test, feature = "measure"))]
-    pub fn contains(self, p: DVec3) -> bool {
+    #[cfg(test)]
+    fn contains(self, p: DVec3) -> bool {
         match self {
             Self::Box(half) => p.abs().cmple(half).all(),
             Self::Ellipsoid(half) => (p / half).length_squared() <= 1.0,
