@@ -351,11 +351,17 @@ pub(crate) fn check_common(
     let is_relative = files_root
         .components()
         .all(|c| matches!(c, Component::Normal(_) | Component::CurDir | Component::ParentDir));
-    require(path, is_relative, "files_root", &files_root, "a relative path")?;
+    require(path, is_relative, "files_root", &format_args!("{}", files_root.display()), "a relative path")?;
     for (role, file) in files {
         let mut components = file.path.components().peekable();
         let is_below = components.peek().is_some() && components.all(|c| matches!(c, Component::Normal(_)));
-        require(path, is_below, role, &file.path, "a relative path without ..")?;
+        require(
+            path,
+            is_below,
+            role,
+            &format_args!("{}", file.path.display()),
+            "a relative path without ..",
+        )?;
         let is_flat = file.data.as_ref().is_none_or(|data| data.data.is_none());
         require(path, is_flat, role, &format_args!("data of data"), "weights in one file")?;
     }

@@ -49,7 +49,7 @@ pub use file_ref::ModelFile;
 pub use floats::Floats;
 pub use model_dir::ModelDir;
 pub use placement::Placement;
-pub use provider::{NoProvider, Provider};
+pub use provider::Provider;
 pub use session::{SessionOptions, find_runtime};
 pub use synonyms::KnownPhrases;
 pub use text_side::{TextSide, TextSideError};

@@ -58,7 +58,7 @@ fn warn_once(message: String) {
 }
 
 /// A tensor of f32, row-major.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Debug, Default)]
 pub(crate) struct Tensor {
     pub(crate) shape: Vec<i64>,
     pub(crate) values: Floats,

@@ -77,7 +77,7 @@ impl Embedding {
     }
 }
 
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default)]
 pub struct Decoded {
     /// The model's estimate of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
     pub predicted_ious: Vec<f32>,
