@@ -121,7 +121,7 @@ pub fn shard(data: &[u8]) -> bool {
             end = run.blocks.end;
             for block in [run.blocks.start, run.blocks.end - 1] {
                 let [occupied, free] = run.masks_of(block);
-                assert_eq!(occupied & free, 0, "{:?}", occupancy.block_at(block));
+                assert_eq!(occupied & free, 0, "block {block}");
             }
         }
     }

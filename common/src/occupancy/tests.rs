@@ -34,9 +34,11 @@ fn blocks(random: &mut Random, n: i32) -> Vec<Block> {
 
 fn blocks_of(occupancy: &Occupancy<'_>) -> Vec<Block> {
     let of_run = |run: BlockRun<'_>| -> Vec<Block> {
+        let OccupancyHeader { first_block: [x, y, z], n_blocks: [_, n_y, n_z], .. } = occupancy.header;
         let block = |index: u32| {
+            let offset = [index / n_z / n_y, index / n_z % n_y, index % n_z].map(|n| n as i32);
             let [occupied, free] = run.masks_of(index);
-            Block { at: occupancy.block_at(index), occupied, free }
+            Block { at: [x + offset[0], y + offset[1], z + offset[2]], occupied, free }
         };
         run.blocks.clone().map(block).collect()
     };
