@@ -12,7 +12,7 @@ use serde::de::IgnoredAny;
 
 use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
-use super::paths::{PhotoFinder, Stated, parent, parts_of, take_back_shared};
+use super::paths::{PhotoFinder, Stated, parent, parts_of, settle};
 use super::view_set::{AppliedTransform, Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::{files, photo};
@@ -116,15 +116,8 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
         views.push(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() });
         stated.push(elsewhere);
     }
-    let mut notes: Vec<String> = take_back_shared(&mut views, &mut stated).into_iter().collect();
-    let moved = views.iter().zip(&stated).filter_map(|(view, stated)| Some((view, stated.as_ref()?)));
-    let moved: Vec<String> =
-        moved.map(|(view, stated)| format!("{} for {}", view.image_path.display(), stated.said)).collect();
-    notes.extend(
-        moved
-            .first()
-            .map(|first| format!("{} photos are not where the file says; found {first}", moved.len())),
-    );
+    let moved = |n: usize, first: &str| format!("{n} photos are not where the file says; found {first}");
+    let mut notes = settle(&mut views, stated, moved);
     notes.extend(not_read(&transforms, &views));
     let applied = applied(&transforms, &folder).map_err(in_file)?;
     Ok(ViewSet { applied, notes, ..view_set(path, views, PoseSource::Transforms, damaged)? })
