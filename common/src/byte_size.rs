@@ -7,21 +7,11 @@ use std::str::FromStr;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ByteSize(pub u64);
 
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum ByteSizeError {
-    #[error("unit {0:?}: expected none, KiB, MiB or GiB, or kB, MB or GB")]
-    Unit(String),
-    #[error("{0:?} is no number of bytes; expected for example 512MiB")]
-    Number(String),
-    #[error("{0:?} is too large")]
-    TooLarge(String),
-}
-
 /// Reads a whole number with an optional unit: `512MiB` and `512M` are binary, `512MB` is decimal.
 impl FromStr for ByteSize {
-    type Err = ByteSizeError;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, ByteSizeError> {
+    fn from_str(text: &str) -> Result<Self, String> {
         let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
         let factor: u64 = match &text[digits.len()..] {
             "" | "B" => 1,
@@ -31,14 +21,14 @@ impl FromStr for ByteSize {
             "kB" | "KB" => 1_000,
             "MB" => 1_000_000,
             "GB" => 1_000_000_000,
-            unit => return Err(ByteSizeError::Unit(unit.to_owned())),
+            unit => return Err(format!("unit {unit:?}: expected none, KiB, MiB or GiB, or kB, MB or GB")),
         };
+        let too_large = || format!("{text:?} is too large");
         let number: u64 = digits.parse().map_err(|e: std::num::ParseIntError| match e.kind() {
-            IntErrorKind::PosOverflow => ByteSizeError::TooLarge(text.to_owned()),
-            _ => ByteSizeError::Number(text.to_owned()),
+            IntErrorKind::PosOverflow => too_large(),
+            _ => format!("{text:?} is no number of bytes; expected for example 512MiB"),
         })?;
-        let bytes = number.checked_mul(factor).ok_or_else(|| ByteSizeError::TooLarge(text.to_owned()))?;
-        Ok(Self(bytes))
+        number.checked_mul(factor).map(Self).ok_or_else(too_large)
     }
 }
 

@@ -178,6 +178,14 @@ impl Layout {
         self.sections.iter().find(|(other, _)| *other == id).map(|(_, range)| range.clone())
     }
 
+    /// Returns the values of a section that was checked; none without it.
+    ///
+    /// # Panics
+    /// If `bytes` are shorter than those checked, or do not start at an aligned address.
+    pub(crate) fn slice<'a, T: AnyBitPattern + NoUninit>(&self, bytes: &'a [u8], id: u32) -> &'a [T] {
+        self.find(id).map_or(&[], |range| bytemuck::cast_slice(&bytes[range]))
+    }
+
     /// Returns the place of a section, which must hold `expected_len` values of `T`.
     pub fn column<T>(
         &self,

@@ -1,7 +1,5 @@
 //! Scene points with feature codes, from which a robot finds the camera of a photo. Byte table: `docs/formats.md`.
 
-use std::ops::Range;
-
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
@@ -54,6 +52,12 @@ pub struct Landmarks<'a> {
 }
 
 impl<'a> Landmarks<'a> {
+    /// Returns the landmarks in a shard's checked bytes.
+    pub(crate) fn of(bytes: &'a [u8], layout: &Layout) -> Option<Self> {
+        let header = bytemuck::from_bytes(&bytes[layout.find(section::HEADER)?]);
+        Some(Self { header, records: layout.slice(bytes, section::LANDMARKS) })
+    }
+
     #[expect(clippy::len_without_is_empty, reason = "a shard without landmarks has no such sections")]
     pub fn len(&self) -> usize {
         self.records.len()
@@ -115,40 +119,24 @@ impl BuiltLandmarks {
     }
 }
 
-#[derive(Clone, Debug)]
-pub(crate) struct LandmarksLayout {
-    header: Range<usize>,
-    records: Range<usize>,
-}
-
-impl LandmarksLayout {
-    /// Checks the landmarks; returns `None` if the shard has none.
-    pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<Option<Self>, ContainerError> {
-        let Some(at) = layout.find(section::HEADER) else { return Ok(None) };
-        let header: LandmarksHeader = layout.value(bytes, section::HEADER, "header of the landmarks")?;
-        let is_sound = |axis: usize| {
-            let (origin, step) = (header.origin_in_world[axis], header.step[axis]);
-            step > 0.0 && origin.is_finite() && (origin + step * STEPS).is_finite()
-        };
-        if ![0, 1, 2].into_iter().all(is_sound) {
-            let what = format!(
-                "landmarks from {:?} in steps of {:?}, expected finite positions and steps above 0",
-                header.origin_in_world, header.step
-            );
-            return Err(damaged(at.start, what));
-        }
-        let n_bytes = layout.find(section::LANDMARKS).map_or(0, |records| records.len());
-        let records =
-            layout.column::<Record>(section::LANDMARKS, "landmarks", n_bytes / size_of::<Record>())?;
-        Ok(Some(Self { header: at, records }))
+/// Checks the landmarks of a shard, if it has any.
+pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<(), ContainerError> {
+    let Some(at) = layout.find(section::HEADER) else { return Ok(()) };
+    let header: LandmarksHeader = layout.value(bytes, section::HEADER, "header of the landmarks")?;
+    let is_sound = |axis: usize| {
+        let (origin, step) = (header.origin_in_world[axis], header.step[axis]);
+        step > 0.0 && origin.is_finite() && (origin + step * STEPS).is_finite()
+    };
+    if ![0, 1, 2].into_iter().all(is_sound) {
+        let what = format!(
+            "landmarks from {:?} in steps of {:?}, expected finite positions and steps above 0",
+            header.origin_in_world, header.step
+        );
+        return Err(damaged(at.start, what));
     }
-
-    pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Landmarks<'a> {
-        Landmarks {
-            header: bytemuck::from_bytes(&bytes[self.header.clone()]),
-            records: bytemuck::cast_slice(&bytes[self.records.clone()]),
-        }
-    }
+    let n_bytes = layout.find(section::LANDMARKS).map_or(0, |records| records.len());
+    let n = n_bytes / size_of::<Record>();
+    layout.column::<Record>(section::LANDMARKS, "landmarks", n).map(drop)
 }
 
 #[cfg(test)]

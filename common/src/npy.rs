@@ -1,12 +1,9 @@
 //! NumPy arrays (`.npy` version 1.0), written.
 
-use std::io::{self, BufReader, Read, Write};
+use std::io::{self, Write};
 use std::path::Path;
 
 use bytemuck::NoUninit;
-use fs_err::File;
-use zip::ZipArchive;
-use zip::result::ZipError;
 
 use crate::durable;
 
@@ -48,23 +45,6 @@ pub fn write<T: Element>(mut out: impl Write, shape: &[usize], values: &[T]) -> 
     out.write_all(&(header.len() as u16).to_le_bytes())?;
     out.write_all(header.as_bytes())?;
     out.write_all(bytemuck::cast_slice(values))
-}
-
-pub struct Npz(ZipArchive<BufReader<File>>);
-
-impl Npz {
-    pub fn open(path: &Path) -> io::Result<Self> {
-        Ok(Self(ZipArchive::new(BufReader::new(File::open(path)?))?))
-    }
-
-    /// Returns the bytes of an array, header included, decompressed while reading; `None` if it is absent.
-    pub fn array(&mut self, name: &str) -> io::Result<Option<impl Read + '_>> {
-        match self.0.by_name(&format!("{name}.npy")) {
-            Ok(member) => Ok(Some(member)),
-            Err(ZipError::FileNotFound) => Ok(None),
-            Err(error) => Err(error.into()),
-        }
-    }
 }
 
 #[cfg(test)]

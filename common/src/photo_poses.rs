@@ -1,7 +1,5 @@
 //! Poses of a scene's photos, so that a page can draw their cameras. Byte table: `docs/formats.md`.
 
-use std::ops::Range;
-
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
@@ -43,6 +41,14 @@ pub struct PhotoPoses<'a> {
 }
 
 impl<'a> PhotoPoses<'a> {
+    /// Returns the photos in a shard's checked bytes.
+    pub(crate) fn of(bytes: &'a [u8], layout: &Layout) -> Option<Self> {
+        layout.find(section::POSES).map(|poses| Self {
+            poses: bytemuck::cast_slice(&bytes[poses]),
+            names: std::str::from_utf8(layout.slice(bytes, section::NAMES)).unwrap_or_default(),
+        })
+    }
+
     pub fn iter(&self) -> impl Iterator<Item = (&'a PhotoPose, &'a str)> + use<'a> {
         let (poses, names) = (self.poses, self.names);
         let starts = std::iter::once(0).chain(poses.iter().map(|pose| pose.name_end as usize));
@@ -87,45 +93,32 @@ impl BuiltPhotoPoses {
     }
 }
 
-#[derive(Clone, Debug)]
-pub(crate) struct PhotoPosesLayout {
-    poses: Range<usize>,
-    names: Range<usize>,
-}
-
-impl PhotoPosesLayout {
-    /// Checks the photos; returns `None` if the shard has none.
-    pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<Option<Self>, ContainerError> {
-        let Some(at) = layout.find(section::POSES) else { return Ok(None) };
-        let n_bytes = layout.find(section::NAMES).map_or(0, |names| names.len());
-        let poses =
-            layout.column::<PhotoPose>(section::POSES, "photo poses", at.len() / size_of::<PhotoPose>())?;
-        let names = layout.column::<u8>(section::NAMES, "names of the photos", n_bytes)?;
-        let text = std::str::from_utf8(&bytes[names.clone()]).ok();
-        let Some(text) = text.filter(|text| !text.chars().any(char::is_control)) else {
-            let what = "the names of the photos are not UTF-8 without control characters";
-            return Err(damaged(names.start, what));
-        };
-        let all: Vec<PhotoPose> = bytemuck::pod_collect_to_vec(&bytes[poses.clone()]);
-        let mut end = 0;
-        for (number, pose) in all.iter().enumerate() {
-            if let Some(what) = fault(pose, end, text) {
-                let offset = poses.start + number * size_of::<PhotoPose>();
-                return Err(damaged(offset, format!("photo {number}: {what}")));
-            }
-            end = pose.name_end as usize;
+/// Checks the photos of a shard, if it has any.
+pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<(), ContainerError> {
+    let Some(at) = layout.find(section::POSES) else { return Ok(()) };
+    let n_bytes = layout.find(section::NAMES).map_or(0, |names| names.len());
+    let poses =
+        layout.column::<PhotoPose>(section::POSES, "photo poses", at.len() / size_of::<PhotoPose>())?;
+    let names = layout.column::<u8>(section::NAMES, "names of the photos", n_bytes)?;
+    let text = std::str::from_utf8(&bytes[names.clone()]).ok();
+    let Some(text) = text.filter(|text| !text.chars().any(char::is_control)) else {
+        let what = "the names of the photos are not UTF-8 without control characters";
+        return Err(damaged(names.start, what));
+    };
+    let all: Vec<PhotoPose> = bytemuck::pod_collect_to_vec(&bytes[poses.clone()]);
+    let mut end = 0;
+    for (number, pose) in all.iter().enumerate() {
+        if let Some(what) = fault(pose, end, text) {
+            let offset = poses.start + number * size_of::<PhotoPose>();
+            return Err(damaged(offset, format!("photo {number}: {what}")));
         }
-        if end != text.len() {
-            let what = format!("the names of the photos end at {end} of {} bytes", text.len());
-            return Err(damaged(names.start, what));
-        }
-        Ok(Some(Self { poses, names }))
+        end = pose.name_end as usize;
     }
-
-    pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> PhotoPoses<'a> {
-        let names = std::str::from_utf8(&bytes[self.names.clone()]).unwrap_or_default();
-        PhotoPoses { poses: bytemuck::cast_slice(&bytes[self.poses.clone()]), names }
+    if end != text.len() {
+        let what = format!("the names of the photos end at {end} of {} bytes", text.len());
+        return Err(damaged(names.start, what));
     }
+    Ok(())
 }
 
 fn fault(pose: &PhotoPose, start: usize, names: &str) -> Option<&'static str> {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::{DMat3, DVec3};
 use slag_common::camera::{Distortion, View};
-use slag_common::poses::{self, Place, PoseError, PoseProblem, PoseSource, ViewSet};
+use slag_common::poses::{self, PoseError, PoseSource, ViewSet};
 use slag_test_support::{needs_shared, shared};
 
 use super::scannet::write;
@@ -24,11 +24,28 @@ fn read_text(cameras: &str, images: &str) -> Result<ViewSet, PoseError> {
     read_files(&[("cameras.txt", cameras.as_bytes()), ("images.txt", images.as_bytes())])
 }
 
-fn problem(result: Result<ViewSet, PoseError>) -> (Place, PoseProblem) {
-    match result {
-        Err(PoseError::Invalid { place, problem, .. }) => (place, problem),
-        other => panic!("not a located problem: {other:?}"),
-    }
+/// Asserts that the error has all these parts: place, fault and advice.
+fn refused(result: Result<ViewSet, PoseError>, parts: &[&str]) {
+    let error = result.expect_err("is refused").to_string();
+    assert!(parts.iter().all(|part| error.contains(part)), "{error}, expected {parts:?}");
+}
+
+/// `cameras.bin` with one camera of 64 x 48 pixels; `model`: COLMAP's number.
+fn camera_bytes(id: u32, model: i32, params: &[f64]) -> Vec<u8> {
+    let mut out = [&1_u64.to_le_bytes()[..], &id.to_le_bytes(), &model.to_le_bytes()].concat();
+    out.extend([64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat());
+    out.extend(params.iter().flat_map(|p| p.to_le_bytes()));
+    out
+}
+
+/// A record of `images.bin`, up to its 2D features. `pose`: QW QX QY QZ TX TY TZ.
+fn image_bytes(pose: [f64; 7], camera_id: u32, name: &str, n_features: u64) -> Vec<u8> {
+    let mut out = 3_u32.to_le_bytes().to_vec();
+    out.extend(pose.iter().flat_map(|v| v.to_le_bytes()));
+    out.extend(camera_id.to_le_bytes());
+    out.extend([name.as_bytes(), b"\0"].concat());
+    out.extend(n_features.to_le_bytes());
+    out
 }
 
 /// Oracle: camera centres in geo.json (`cam_enu`), computed by another program and rounded to a millimetre.
@@ -145,17 +162,9 @@ fn lens_models() {
             "3 1 0 0 0 1 2 3 7 with space/a b.jpg\n\n",
         );
 
-        let mut cameras = 1_u64.to_le_bytes().to_vec();
-        cameras.extend([7_u32.to_le_bytes(), number.to_le_bytes()].concat());
-        cameras.extend([64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat());
-        cameras.extend(params.iter().flat_map(|p| p.to_le_bytes()));
-        let mut images = 1_u64.to_le_bytes().to_vec();
-        images.extend(3_u32.to_le_bytes());
-        images.extend([1.0_f64, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes()));
-        images.extend(7_u32.to_le_bytes());
-        images.extend(b"with space/a b.jpg\0");
-        images.extend(2_u64.to_le_bytes());
-        images.extend([0xFF; 48]);
+        let cameras = camera_bytes(7, number, params);
+        let image = image_bytes([1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0], 7, "with space/a b.jpg", 2);
+        let images = [&1_u64.to_le_bytes()[..], &image, &[0xFF; 48]].concat();
         let binary = read_files(&[("sparse/cameras.bin", &cameras), ("sparse/images.bin", &images)]);
 
         for set in [text.unwrap(), binary.unwrap()] {
@@ -182,45 +191,37 @@ fn colmap_errors_have_place_and_fault() {
     const CAMERA: &str = "1 PINHOLE 64 48 50 50 32 24\n";
     const IMAGE: &str = "1 1 0 0 0 0 0 0 1 a.jpg\n\n";
 
-    let (place, what) = problem(read_text("# comment\n1 FULL_OPENCV 64 48 1 1 1 1 0 0 0 0 0 0 0 0\n", IMAGE));
-    assert_eq!(place, Place::Line(2));
-    assert_eq!(what, PoseProblem::UnsupportedModel { camera_id: 1, model: "FULL_OPENCV".into() });
-    assert!(what.to_string().contains("image_undistorter"));
     for unused in ["2 FOV 64 48 50 50 32 24 0.1", "2 SPHERE 64 48", "2 PINHOLE 0 0 0 0 0 0", "2"] {
         let set = read_text(&format!("{unused}\n{CAMERA}"), IMAGE);
         assert_eq!(set.unwrap().views.len(), 1, "{unused}");
     }
-
-    let (place, what) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 2 a.jpg\n\n"));
-    assert_eq!(
-        (place, what),
-        (Place::Line(1), PoseProblem::UnknownCamera { image: "a.jpg".into(), camera_id: 2 })
-    );
-
-    let (_, what) = problem(read_text(CAMERA, "1 1.1 0 0 0 0 0 0 1 a.jpg\n\n"));
-    assert!(matches!(what, PoseProblem::NotARotation { image, .. } if image == "a.jpg"));
-    let (place, what) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 three\n"));
-    assert_eq!(place, Place::Line(2));
-    assert!(what.to_string().contains("three"), "{what}");
-    let (_, what) = problem(read_text("1 OPENCV 64 48 50 50 32 24 0.1 0.2\n", IMAGE));
-    assert!(what.to_string().contains("OPENCV has 8 parameters, found 6"), "{what}");
-
-    let (_, what) = problem(read_text(CAMERA, &IMAGE.repeat(2)));
-    assert_eq!(what, PoseProblem::DuplicateImage { image: "a.jpg".into() });
+    for (images, parts) in [
+        ("1 1 0 0 0 0 0 0 2 a.jpg\n\n", ["images.txt: line 1: ", "\"a.jpg\" uses camera 2"]),
+        ("1 1.1 0 0 0 0 0 0 1 a.jpg\n\n", ["\"a.jpg\": its rotation is off by 1.000e-1", "without scale"]),
+        ("1 1 0 0 0 0 0 0 1 a.jpg\n1 2 three\n", ["line 2: ", "three"]),
+        (&IMAGE.repeat(2), ["two images have the name \"a.jpg\"", "rename"]),
+        ("# nothing\n", ["no posed images", "check that"]),
+    ] {
+        refused(read_text(CAMERA, images), &parts);
+    }
+    for (cameras, parts) in [
+        (
+            "# comment\n1 FULL_OPENCV 64 48 1 1 1 1 0 0 0 0 0 0 0 0\n",
+            ["cameras.txt: line 2: camera 1: model FULL_OPENCV is not supported", "image_undistorter"],
+        ),
+        ("1 OPENCV 64 48 50 50 32 24 0.1 0.2\n", ["line 1: ", "OPENCV has 8 parameters, found 6"]),
+        ("1 PINHOLE 0 48 50 50 32 24", ["line 1: ", "width is 0, expected a whole number"]),
+        ("1 PINHOLE 64 48 -50 50 32 24", ["line 1: ", "focal length x is -50"]),
+        ("1 PINHOLE 64 48 50 50 inf 24", ["line 1: ", "principal point x is inf"]),
+        (&CAMERA.repeat(2), ["line 2: ", "two cameras have the id 1"]),
+    ] {
+        refused(read_text(cameras, IMAGE), &parts);
+    }
     for name in ["..", "/", "", "a/../../b.jpg"] {
-        let (_, what) = problem(read_text(CAMERA, &format!("1 1 0 0 0 0 0 0 1 {name}\n\n")));
-        assert!(matches!(what, PoseProblem::UnsafeName { .. }), "{name}: {what}");
+        let read = read_text(CAMERA, &format!("1 1 0 0 0 0 0 0 1 {name}\n\n"));
+        refused(read, &["is not a relative path inside the image folder"]);
     }
-    for camera in
-        ["1 PINHOLE 0 48 50 50 32 24", "1 PINHOLE 64 48 -50 50 32 24", "1 PINHOLE 64 48 50 50 inf 24"]
-    {
-        let (place, what) = problem(read_text(camera, IMAGE));
-        assert_eq!(place, Place::Line(1));
-        assert!(matches!(what, PoseProblem::BadIntrinsics { .. }), "{camera}: {what}");
-    }
-    assert_eq!(problem(read_text(CAMERA, "# nothing\n")).1, PoseProblem::NoViews);
-    assert_eq!(problem(read_text(&CAMERA.repeat(2), IMAGE)).1, PoseProblem::DuplicateCamera { camera_id: 1 });
-    assert!(matches!(read_files(&[("cameras.txt", b"")]), Err(PoseError::NotFound { .. })));
+    refused(read_files(&[("cameras.txt", b"")]), &["no poses found"]);
 }
 
 /// Lines of features may be missing, names may have several words; images without a pose are omitted and named.
@@ -256,21 +257,16 @@ fn frames_without_a_valid_pose_are_left_out() {
     ] {
         let text = read_text(CAMERA, &format!("1 {good} 1 a.jpg\n\n2 {bad} 1 b.jpg\n\n")).unwrap();
         let record = |name: &str, pose: &str| {
-            let numbers = pose.split(' ').flat_map(|v| v.parse::<f64>().unwrap().to_le_bytes());
-            let head = 1_u32.to_le_bytes().into_iter().chain(numbers).chain(1_u32.to_le_bytes());
-            head.chain(name.bytes()).chain([0; 9]).collect::<Vec<u8>>()
+            let numbers: Vec<f64> = pose.split(' ').map(|v| v.parse().unwrap()).collect();
+            image_bytes(numbers.try_into().unwrap(), 1, name, 0)
         };
-        let mut cameras = [1_u64.to_le_bytes().to_vec(), 1_u32.to_le_bytes().to_vec()].concat();
-        cameras.extend(0_i32.to_le_bytes());
-        cameras.extend([64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat());
-        cameras.extend([50.0_f64, 32.0, 24.0].iter().flat_map(|v| v.to_le_bytes()));
+        let cameras = camera_bytes(1, 0, &[50.0, 32.0, 24.0]);
         let images = [2_u64.to_le_bytes().to_vec(), record("a.jpg", good), record("b.jpg", bad)].concat();
         let binary = read_files(&[("cameras.bin", &cameras), ("images.bin", &images)]).unwrap();
         for set in [text, binary] {
             assert_eq!((set.views.len(), &set.damaged[0].0[..], set.damaged.len()), (1, "b.jpg", 1), "{bad}");
         }
-        let (place, _) = problem(read_text(CAMERA, &format!("2 {bad} 1 b.jpg\n")));
-        assert_eq!(place, Place::Line(1));
+        refused(read_text(CAMERA, &format!("2 {bad} 1 b.jpg\n")), &["images.txt: line 1: \"b.jpg\": "]);
     }
     let mut bad = vec![frame("b.jpg"); 5];
     bad[0].as_object_mut().unwrap().remove("transform_matrix");
@@ -285,7 +281,7 @@ fn frames_without_a_valid_pose_are_left_out() {
         let set = read(&[frame("a.jpg"), bad.clone()]).unwrap();
         assert_eq!((set.views.len(), &set.damaged[0].0[..]), (1, "b.jpg"), "{bad}");
         assert!(set.left_out().unwrap().contains("1 of 2 frames have no pose"), "{bad}");
-        assert_eq!(problem(read(&[bad.clone(), bad])).0, Place::Frame(0));
+        refused(read(&[bad.clone(), bad]), &["transforms.json: frames[0]: \"b.jpg\": "]);
     }
     let mut rounded = frame("a.jpg");
     rounded["transform_matrix"][3] = serde_json::json!([1e-9, 0, -1e-8, 1.0000001]);
@@ -440,18 +436,13 @@ fn transforms_of_other_programs_are_read() {
 /// Counts of 2D features beyond the file's end, by one record and by overflow.
 #[test]
 fn counts_are_not_trusted() {
-    let camera = [&1_u64.to_le_bytes()[..], &1_u32.to_le_bytes(), &0_i32.to_le_bytes()].concat();
-    let sizes = [64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat();
-    let params: Vec<u8> = [50.0_f64, 32.0, 24.0].iter().flat_map(|v| v.to_le_bytes()).collect();
-    let cameras = [camera, sizes, params].concat();
+    let cameras = camera_bytes(1, 0, &[50.0, 32.0, 24.0]);
     for n_features in [2, u64::MAX / 24, u64::MAX] {
-        let pose = [1.0_f64, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes());
-        let mut images = [&1_u64.to_le_bytes()[..], &3_u32.to_le_bytes()].concat();
-        images.extend(pose.chain(1_u32.to_le_bytes()).chain(*b"a.jpg\0").chain(u64::to_le_bytes(n_features)));
-        images.extend([0; 24]);
-        let (place, what) = problem(read_files(&[("cameras.bin", &cameras), ("images.bin", &images)]));
-        assert_eq!(place, Place::Byte(8 + 4 + 56 + 4 + 6 + 8));
-        assert_eq!(what, PoseProblem::Truncated { expected: "the image's 2D features" });
+        let image = image_bytes([1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0], 1, "a.jpg", n_features);
+        let images = [&1_u64.to_le_bytes()[..], &image, &[0; 24]].concat();
+        let place = format!("images.bin: byte {}: ", 8 + 4 + 56 + 4 + 6 + 8);
+        let read = read_files(&[("cameras.bin", &cameras), ("images.bin", &images)]);
+        refused(read, &[&place, "ends before the image's 2D features"]);
     }
 }
 
@@ -538,34 +529,35 @@ fn transforms_errors_have_place_and_fault() {
         let mut json =
             serde_json::json!({"fl_x": 60, "w": 64, "h": 48, "frames": [frame("a.jpg"), frame("b.jpg")]});
         json[key] = value;
-        problem(read_json(json))
+        read_json(json)
     };
-    let (place, what) = with("camera_model", "EQUIRECTANGULAR".into());
-    assert_eq!(
-        (place, what),
-        (Place::Frame(0), PoseProblem::UnsupportedLens { model: "EQUIRECTANGULAR".into() })
-    );
-    for key in ["k4", "k5", "k6", "b1", "b2"] {
-        assert!(matches!(with(key, 0.1.into()).1, PoseProblem::UnsupportedLens { .. }), "{key}");
+    for (key, value, fault) in [
+        ("camera_model", "EQUIRECTANGULAR".into(), "lens model EQUIRECTANGULAR is not supported"),
+        ("k4", 0.1.into(), "lens model OPENCV with k4 is not supported"),
+        ("k5", 0.1.into(), "lens model OPENCV with k5 is not supported"),
+        ("b2", 0.1.into(), "lens model OPENCV with b2 is not supported"),
+        ("w", 64.5.into(), "width is 64.5"),
+        ("h", serde_json::Value::Null, "its size is unknown"),
+        ("fl_x", serde_json::Value::Null, "fl_x, or camera_angle_x within 0..pi radians, is missing"),
+    ] {
+        refused(with(key, value), &["transforms.json: frames[0]: ", fault]);
     }
-    assert!(matches!(with("w", 64.5.into()).1, PoseProblem::BadIntrinsics { .. }));
-    assert!(with("h", serde_json::Value::Null).1.to_string().contains("its size is unknown"));
-    assert!(matches!(with("fl_x", serde_json::Value::Null).1, PoseProblem::MissingIntrinsics { .. }));
-
-    for (row, column, value) in [(0, 0, 1.1), (0, 0, -1.0), (1, 0, 0.1), (3, 3, 2.0)] {
+    for (row, column, value, fault) in [
+        (0, 0, 1.1, "\"b.jpg\": its rotation is off by"),
+        (0, 0, -1.0, "\"b.jpg\": its matrix mirrors"),
+        (1, 0, 0.1, "\"b.jpg\": its rotation is off by"),
+        (3, 3, 2.0, "the fourth row being 0 0 0 1"),
+    ] {
         let mut bad = frame("b.jpg");
         bad["transform_matrix"][row][column] = value.into();
-        let (place, what) = with("frames", serde_json::json!([bad, bad]));
-        assert_eq!(place, Place::Frame(0));
-        let names_it = matches!(
-            &what,
-            PoseProblem::NotARotation { image, .. } | PoseProblem::Mirrored { image } if image == "b.jpg"
-        );
-        assert!(names_it || row == 3, "{row} {column} {value}: {what}");
+        refused(with("frames", serde_json::json!([bad, bad])), &["frames[0]: ", fault]);
     }
     let twice = serde_json::json!([frame("images/a.jpg"), frame("images_2/a.jpg")]);
-    assert_eq!(with("frames", twice).1, PoseProblem::DuplicateImage { image: "a.jpg".into() });
-    assert!(matches!(read_files(&[("transforms.json", b"{\"frames\": 3}")]), Err(PoseError::Json { .. })));
+    refused(with("frames", twice), &["two images have the name \"a.jpg\""]);
+    refused(
+        read_files(&[("transforms.json", b"{\"frames\": 3}")]),
+        &["export the file again with nerfstudio"],
+    );
 }
 
 /// Two images of one file name are two views if their folders differ.

@@ -4,36 +4,28 @@ use std::collections::BTreeMap;
 use std::sync::OnceLock;
 
 use ed25519_dalek::SigningKey;
-use slag_common::tuf::{FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, sign};
+use slag_common::tuf::{FileMeta, Root, SignedMetadata, Snapshot, Timestamp, one_key_repository, sign};
 
 pub fn key() -> SigningKey {
     SigningKey::from_bytes(&[7; 32])
 }
 
 /// Roles state versions only, so that each file may be replaced.
-pub fn repository() -> &'static BTreeMap<&'static str, Vec<u8>> {
-    static FILES: OnceLock<BTreeMap<&'static str, Vec<u8>>> = OnceLock::new();
+pub fn repository() -> &'static BTreeMap<String, Vec<u8>> {
+    static FILES: OnceLock<BTreeMap<String, Vec<u8>>> = OnceLock::new();
     FILES.get_or_init(|| {
         let (key, never) = (key(), u64::MAX);
-        let public = Key::of(&key);
-        let role = RoleKeys { keyids: vec![public.id()], threshold: 1 };
-        let roles = ["root", "targets", "snapshot", "timestamp"].map(|name| (name.to_owned(), role.clone()));
-        let keys = BTreeMap::from([(public.id(), public)]);
-        let root = Root { consistent_snapshot: true, keys, roles: roles.into() };
+        let mut files = one_key_repository(&key, 1, "manifest", b"x");
+        let root = SignedMetadata::<Root>::parse("root", &files["1.root.json"]).expect("valid").body;
         let meta = |name: &str| {
             BTreeMap::from([(name.to_owned(), FileMeta { version: 1, length: None, hashes: None })])
         };
-        let targets = BTreeMap::from([("manifest".to_owned(), TargetFile::of(b"x"))]);
-        let targets = Targets { targets };
         let snapshot = Snapshot { meta: meta("targets.json") };
         let timestamp = Timestamp { meta: meta("snapshot.json"), signed_at: None };
-        BTreeMap::from([
-            ("1.root.json", sign(1, never, &root, &[&key])),
-            ("2.root.json", sign(2, never, &root, &[&key])),
-            ("timestamp.json", sign(1, never, &timestamp, &[&key])),
-            ("1.snapshot.json", sign(1, never, &snapshot, &[&key])),
-            ("1.targets.json", sign(1, never, &targets, &[&key])),
-        ])
+        files.insert("2.root.json".into(), sign(2, never, &root, &[&key]));
+        files.insert("1.snapshot.json".into(), sign(1, never, &snapshot, &[&key]));
+        files.insert("timestamp.json".into(), sign(1, never, &timestamp, &[&key]));
+        files
     })
 }
 
@@ -43,7 +35,7 @@ pub const REPLACED: [&str; 4] = ["2.root.json", "timestamp.json", "1.snapshot.js
 /// A seed for each role: its byte, and its signed content.
 pub fn seeds() -> Vec<Vec<u8>> {
     let seed = |(number, name): (usize, &&str)| {
-        let text = String::from_utf8(repository()[name].clone()).expect("JSON is text");
+        let text = String::from_utf8(repository()[*name].clone()).expect("JSON is text");
         let at = text.find("\"signed\":").expect("signed") + "\"signed\":".len();
         [&[b'0' + number as u8], &text.as_bytes()[at..text.len() - 1]].concat()
     };

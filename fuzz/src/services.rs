@@ -87,7 +87,7 @@ pub fn http_request(data: &[u8]) -> bool {
     answer.starts_with("HTTP/1.1 2")
 }
 
-struct Files(BTreeMap<&'static str, Vec<u8>>);
+struct Files(BTreeMap<String, Vec<u8>>);
 
 impl Source for Files {
     fn metadata(&mut self, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, String> {
@@ -101,7 +101,7 @@ pub fn tuf(data: &[u8]) -> bool {
     let envelope = [b"{\"signatures\":[],\"signed\":", signed, b"}"].concat();
     let bytes = add_signatures("a role", &envelope, &[key()]).unwrap_or(envelope);
     let mut source = Files(repository().clone());
-    source.0.insert(REPLACED[usize::from(role % 4)], bytes);
+    source.0.insert(REPLACED[usize::from(role % 4)].to_owned(), bytes);
     let mut kept = Kept::from_root(&source.0["1.root.json"]).expect("an honest root");
     let Ok(trusted) = refresh(&mut kept, &mut source, 1_800_000_000) else { return false };
     for path in ["manifest", "scene/manifest"] {

@@ -1,5 +1,6 @@
 //! Seeded faults: any part of a fleet is killed, paused, cut off or restarted empty, and the bytes stay the same.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::time::Duration;
 
@@ -24,49 +25,25 @@ fn seeded_faults_do_not_show() {
     for seed in first..first + n_runs {
         let faults = run_with_faults(seed);
         println!("seed {seed}: same bytes; {faults}");
-        all.add(faults);
+        faults.0.into_iter().for_each(|(fault, n)| *all.0.entry(fault).or_default() += n);
     }
     println!("{n_runs} runs: {all}");
 }
 
-/// Faults of a fleet.
-#[derive(Clone, Copy, Default)]
-struct Faults {
-    n_workers_killed: u64,
-    n_workers_paused: u64,
-    n_partitions: u64,
-    n_slow_networks: u64,
-    n_servers_killed: u64,
-    n_servers_emptied: u64,
-    n_coordinators_killed: u64,
-}
+/// Faults of a fleet, and how often each was made.
+#[derive(Default)]
+struct Faults(BTreeMap<&'static str, u64>);
 
 impl Faults {
-    fn add(&mut self, other: Self) {
-        self.n_workers_killed += other.n_workers_killed;
-        self.n_workers_paused += other.n_workers_paused;
-        self.n_partitions += other.n_partitions;
-        self.n_slow_networks += other.n_slow_networks;
-        self.n_servers_killed += other.n_servers_killed;
-        self.n_servers_emptied += other.n_servers_emptied;
-        self.n_coordinators_killed += other.n_coordinators_killed;
+    fn count(&mut self, fault: &'static str) {
+        *self.0.entry(fault).or_default() += 1;
     }
 }
 
 impl fmt::Display for Faults {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "{} workers killed, {} paused, {} cut off, {} on a slow network, {} servers killed ({} came back empty), \
-             {} coordinators killed",
-            self.n_workers_killed,
-            self.n_workers_paused,
-            self.n_partitions,
-            self.n_slow_networks,
-            self.n_servers_killed,
-            self.n_servers_emptied,
-            self.n_coordinators_killed
-        )
+        let told: Vec<String> = self.0.iter().map(|(fault, n)| format!("{n} {fault}")).collect();
+        f.write_str(&told.join(", "))
     }
 }
 
@@ -90,36 +67,35 @@ fn run_with_faults(seed: u64) -> Faults {
             0..3 => {
                 // One that ended because no run was open is also replaced.
                 drop(std::mem::replace(&mut workers[which], start(which)));
-                faults.n_workers_killed += 1;
+                faults.count("workers killed");
             }
             3..5 if workers[which].is_running() => {
                 workers[which].signal("STOP");
                 std::thread::sleep(Duration::from_secs_f64(2.0 * random.unit()));
                 workers[which].signal("CONT");
-                faults.n_workers_paused += 1;
+                faults.count("workers paused");
             }
             5..7 => {
                 networks[which].set(Weather { is_cut: true, ..Weather::default() });
                 std::thread::sleep(Duration::from_secs_f64(3.0 * random.unit()));
                 networks[which].set(Weather::default());
-                faults.n_partitions += 1;
+                faults.count("workers cut off");
             }
             7..9 => {
                 let delay = Duration::from_secs_f64(0.05 * random.unit());
                 networks[which].set(Weather { delay, loss: 0.1 * random.unit(), is_cut: false });
-                faults.n_slow_networks += 1;
+                faults.count("workers on a slow network");
             }
             9..11 => {
                 let is_lost = random.unit() < 0.5;
                 let old = server.take().expect("one runs");
-                faults.n_servers_killed += 1;
-                faults.n_servers_emptied += u64::from(is_lost);
+                faults.count(if is_lost { "servers replaced by empty ones" } else { "servers killed" });
                 server = Some(fleet.restart(old, is_lost));
             }
             11 => {
                 drop(coordinator);
                 coordinator = fleet.coordinator(&flags);
-                faults.n_coordinators_killed += 1;
+                faults.count("coordinators killed");
             }
             _ => {}
         }

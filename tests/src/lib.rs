@@ -6,7 +6,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 
 use serde_json::Value;
-pub use slag_test_support::{needs_shared, nightly, shared, trials};
+pub use slag_test_support::{needs_shared, nightly, npz_array, shared, trials};
 
 mod authority;
 mod made;

@@ -8,8 +8,9 @@ use ort::logging::LogLevel;
 use ort::session::RunOptions;
 use ort::value::{DynTensor, DynTensorValueType};
 
+use crate::ModelError;
 use crate::placement::DeviceMemory;
-use crate::session::{Model, SessionError};
+use crate::session::Model;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Place {
@@ -62,7 +63,7 @@ impl Model {
         memory: &DeviceMemory,
         inputs: &[(&str, &DynTensor)],
         outputs: &[(&str, Place)],
-    ) -> Result<Vec<DynTensor>, SessionError> {
+    ) -> Result<Vec<DynTensor>, ModelError> {
         self.try_bound(memory, inputs, outputs).map_err(|cause| self.run_error(cause))
     }
 

@@ -9,8 +9,8 @@ use ort::value::TensorElementType;
 use sha2::{Digest, Sha256};
 
 use crate::{
-    ModelFile,
-    session::{Model, SessionError, SessionOptions},
+    ModelError, ModelFile,
+    session::{Model, SessionOptions},
 };
 
 const SEGMENT: &[u8] = include_bytes!("../embedded/segment.onnx");
@@ -31,7 +31,7 @@ pub const N_NEIGHBOURS: usize = 4;
 pub struct Boundaries(Model);
 
 impl Boundaries {
-    pub fn open(options: &SessionOptions) -> Result<Self, SessionError> {
+    pub fn open(options: &SessionOptions) -> Result<Self, ModelError> {
         let model = Model::open(&ModelFile::embedded(Path::new("segment.onnx"), SEGMENT), options)?;
         model.expect_input(INPUT, TensorElementType::Float32, &[1, N_CHANNELS as i64, -1, -1])?;
         Ok(Self(model))
@@ -45,7 +45,7 @@ impl Boundaries {
     /// right, below left, below, below right.
     ///
     /// `depth_m`: `[height][width]`, along the camera's axis; at most 0, or NaN, where it is unknown.
-    pub fn of(&mut self, image: &RgbImage, depth_m: Option<&[f32]>) -> Result<Vec<f32>, SessionError> {
+    pub fn of(&mut self, image: &RgbImage, depth_m: Option<&[f32]>) -> Result<Vec<f32>, ModelError> {
         let (width, height) = image.dimensions();
         let [wide, high] = [width, height].map(|side| side.next_multiple_of(MULTIPLE));
         let of_depth = depth_m.map(|depth_m| depth_channels(depth_m, width as usize));

@@ -36,22 +36,9 @@ const LATIN_1_NAMES: &str = "nbsp iexcl cent pound curren yen brvbar sect uml co
     igrave iacute icirc iuml eth ntilde ograve oacute ocirc otilde ouml divide oslash ugrave uacute ucirc uuml yacute thorn \
     yuml";
 
-const OTHER_NAMES: [(&str, char); 14] = [
-    ("amp", '&'),
-    ("lt", '<'),
-    ("gt", '>'),
-    ("quot", '"'),
-    ("apos", '\''),
-    ("euro", '€'),
-    ("ndash", '–'),
-    ("mdash", '—'),
-    ("lsquo", '‘'),
-    ("rsquo", '’'),
-    ("ldquo", '“'),
-    ("rdquo", '”'),
-    ("hellip", '…'),
-    ("bull", '•'),
-];
+const OTHER_NAMES: &str = "amp lt gt quot apos euro ndash mdash lsquo rsquo ldquo rdquo hellip bull";
+/// Their characters.
+const OTHERS: &str = "&<>\"'€–—‘’“”…•";
 
 /// Replaces HTML character references that end in a semicolon.
 fn unescape(text: &str) -> String {
@@ -84,9 +71,9 @@ fn referenced(name: &str) -> Option<char> {
         };
         return char::from_u32(code.ok()?);
     }
-    let latin_1 = LATIN_1_NAMES.split_ascii_whitespace().position(|n| n == name);
-    let other = || OTHER_NAMES.iter().find(|(n, _)| *n == name).map(|&(_, c)| c);
-    latin_1.and_then(|i| char::from_u32(0xa0 + i as u32)).or_else(other)
+    let place = |names: &str| names.split_ascii_whitespace().position(|n| n == name);
+    let latin_1 = place(LATIN_1_NAMES).and_then(|i| char::from_u32(0xa0 + i as u32));
+    latin_1.or_else(|| OTHERS.chars().nth(place(OTHER_NAMES)?))
 }
 
 /// Undoes UTF-8 read as Windows-1252 for U+0080 to U+00FF and U+2000 to U+203F: accents and quotes of western text.

@@ -51,32 +51,10 @@ pub const DIM: usize = N_COLOURS + SHAPES.len();
 /// shape, above the threshold, and 0.88 for its colour.
 const SHAPE_WEIGHT: f32 = 0.5;
 
-const SYNONYMS: [(&str, &str); 24] = [
-    ("gray", "grey"),
-    ("silver", "grey"),
-    ("dark", "black"),
-    ("scarlet", "red"),
-    ("crimson", "red"),
-    ("lime", "green"),
-    ("navy", "blue"),
-    ("azure", "blue"),
-    ("gold", "yellow"),
-    ("golden", "yellow"),
-    ("amber", "orange"),
-    ("beige", "brown"),
-    ("tan", "brown"),
-    ("wooden", "brown"),
-    ("magenta", "pink"),
-    ("rose", "pink"),
-    ("violet", "purple"),
-    ("lilac", "purple"),
-    ("upright", "tall"),
-    ("vertical", "tall"),
-    ("horizontal", "wide"),
-    ("flat", "wide"),
-    ("circular", "round"),
-    ("ball-shaped", "round"),
-];
+/// Other words, each before the one that it means.
+const SYNONYMS: &str = "gray grey, silver grey, dark black, scarlet red, crimson red, lime green, navy blue, azure blue, \
+    gold yellow, golden yellow, amber orange, beige brown, tan brown, wooden brown, magenta pink, rose pink, violet purple, \
+    lilac purple, upright tall, vertical tall, horizontal wide, flat wide, circular round, ball-shaped round";
 
 /// Words that say nothing about colour or shape.
 const STOP_WORDS: &str = "a an the and or of with in is are that this some any all thing things object objects item items \
@@ -107,7 +85,8 @@ impl TextEncoder for ColourShape {
         let mut is_empty = true;
         for word in words {
             is_empty = false;
-            let term = SYNONYMS.iter().find(|(other, _)| *other == word).map_or(word, |&(_, term)| term);
+            let mut synonyms = SYNONYMS.split(", ").filter_map(|pair| pair.split_once(' '));
+            let term = synonyms.find(|(other, _)| *other == word).map_or(word, |(_, term)| term);
             if let Some(colour) = COLOURS.iter().position(|&c| c == term) {
                 for (i, x) in vector[..N_COLOURS].iter_mut().enumerate() {
                     *x += f32::from(u8::from(i == colour)) - 1.0 / N_COLOURS as f32;

@@ -8,8 +8,7 @@ use clap::{Args, Subcommand};
 use serde::Serialize;
 
 use crate::hub::{Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, cache_folder, models_folder};
-use crate::session::SessionError;
-use crate::{ModelDir, Provider, SessionOptions, find_runtime};
+use crate::{ModelDir, ModelError, Provider, SessionOptions, find_runtime};
 
 /// The `models` subcommands.
 #[derive(Debug, Subcommand)]
@@ -80,7 +79,7 @@ impl RunArgs {
         &self,
         beside: &[PathBuf],
         default_threads: usize,
-    ) -> Result<SessionOptions, SessionError> {
+    ) -> Result<SessionOptions, ModelError> {
         let intra_op_threads = self.model_threads.map_or(default_threads, |n| n as usize);
         let runtime = find_runtime(self.runtime.as_deref(), beside)?;
         let providers = self.provider.clone();
@@ -108,7 +107,7 @@ pub fn resolve(
     variable: &dyn Fn(&str) -> Option<std::ffi::OsString>,
 ) -> Result<PathBuf, HubError> {
     match options(variable) {
-        Some(options) => Hub::new(options)?.resolve(model),
+        Some(options) => Hub::new(options).resolve(model),
         None => Ok(model.to_owned()),
     }
 }
@@ -149,11 +148,15 @@ pub fn ask(question: &str) -> bool {
 }
 
 pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, HubError> {
-    let mut options = options(context.variable).ok_or(HubError::NoFolder)?;
+    let no_folder = || {
+        let fault = "neither XDG_CACHE_HOME nor HOME is an absolute path, so there is no folder for models";
+        HubError::Other(format!("{fault}; set one of them"))
+    };
+    let mut options = options(context.variable).ok_or_else(no_folder)?;
     if let ModelsCommand::Pull(PullArgs { hub, .. }) = command {
         options.hub.clone_from(hub);
     }
-    let hub = Hub::new(options)?;
+    let hub = Hub::new(options);
     match command {
         ModelsCommand::List => {
             Ok(Report::Models(hub.table().models.iter().map(|entry| Listed::new(&hub, entry)).collect()))

@@ -63,13 +63,14 @@
 //! Unknown fields are refused. On a robot, which has only the text files, the image file's `sha256` must be
 //! recorded, because the encoder id covers both.
 
-use std::fmt;
+use std::fmt::{self, Debug};
 use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use sha2::Digest;
 use slag_common::files;
 
+use crate::ModelError;
 use crate::preprocess::{Filter, Preprocess, Resize};
 
 pub use crate::file_ref::{FileRef, Sha256};
@@ -77,22 +78,6 @@ pub use crate::file_ref::{FileRef, Sha256};
 pub const FILE_NAME: &str = "model.toml";
 
 const MAX_PATCHES_PER_SIDE: u16 = 256;
-
-#[derive(Debug, thiserror::Error)]
-pub enum DescriptionError {
-    #[error("{cause}; put the file there or correct the description")]
-    Read { cause: std::io::Error },
-    #[error("{}: {cause}; see the fields of {FILE_NAME} in its documentation", path.display())]
-    Format { path: PathBuf, cause: Box<toml::de::Error> },
-    #[error("{}: {cause}; use a robot program and an encoder of matching versions", path.display())]
-    Json { path: PathBuf, cause: serde_json::Error },
-    #[error("{}: {field} is {found}, expected {expected}; correct it", path.display())]
-    Value { path: PathBuf, field: &'static str, found: String, expected: &'static str },
-    #[error("{}: SHA-256 is {found}, expected {expected}; fetch the file again or correct the description", path.display())]
-    Hash { path: PathBuf, expected: String, found: String },
-    #[error("{}: absent, and {FILE_NAME} records no sha256 for it; record it or put the file there", path.display())]
-    NoHash { path: PathBuf },
-}
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -229,21 +214,22 @@ pub struct CentreDescription {
 }
 
 impl Description {
-    pub fn read(path: &Path) -> Result<Self, DescriptionError> {
+    pub fn read(path: &Path) -> Result<Self, ModelError> {
         Self::parse(path, &read_text(path)?)
     }
 
     /// Parses and checks a description; `path` is for messages.
-    pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, DescriptionError> {
+    pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, ModelError> {
         let description: Self = parse_toml(path, text)?;
         description.check(path)?;
         Ok(description)
     }
 
     /// Parses and checks a description in JSON, as stores carry it; `path` is for messages.
-    pub(crate) fn from_json(path: &Path, bytes: &[u8]) -> Result<Self, DescriptionError> {
-        let parsed: Result<Self, _> = serde_json::from_slice(bytes);
-        let description = parsed.map_err(|cause| DescriptionError::Json { path: path.to_owned(), cause })?;
+    pub(crate) fn from_json(path: &Path, bytes: &[u8]) -> Result<Self, ModelError> {
+        let advice = "use a robot program and an encoder of matching versions";
+        let description: Self = serde_json::from_slice(bytes)
+            .map_err(|cause| ModelError::at(path, format_args!("{cause}; {advice}")))?;
         description.check(path)?;
         Ok(description)
     }
@@ -285,88 +271,71 @@ impl Description {
         EncoderId { name: self.name.clone(), dim: self.dim, definition }
     }
 
-    fn check(&self, path: &Path) -> Result<(), DescriptionError> {
+    fn check(&self, path: &Path) -> Result<(), ModelError> {
         check_common(path, &self.name, &self.files_root, &self.files())?;
-        let require = |holds, field, found, expected| require(path, holds, field, found, expected);
+        let require =
+            |holds, field, found: &dyn Debug, expected| require(path, holds, field, found, expected);
         let image = &self.image;
-        require((1..=1 << 16).contains(&self.dim), "dim", self.dim.to_string(), "1 to 65536")?;
-        require(
-            (1..=2048).contains(&image.size_px),
-            "image.size_px",
-            image.size_px.to_string(),
-            "1 to 2048",
-        )?;
+        require((1..=1 << 16).contains(&self.dim), "dim", &self.dim, "1 to 65536")?;
+        require((1..=2048).contains(&image.size_px), "image.size_px", &image.size_px, "1 to 2048")?;
         let batch = image.batch.unwrap_or(1);
-        require((1..=1024).contains(&batch), "image.batch", batch.to_string(), "1 to 1024")?;
-        require(
-            image.mean.iter().all(|x| x.is_finite()),
-            "image.mean",
-            format!("{:?}", image.mean),
-            "three finite numbers",
-        )?;
-        require(
-            image.std.iter().all(|x| x.is_finite() && *x > 0.0),
-            "image.std",
-            format!("{:?}", image.std),
-            "three numbers above 0",
-        )?;
+        require((1..=1024).contains(&batch), "image.batch", &batch, "1 to 1024")?;
+        let is_finite = image.mean.iter().all(|x| x.is_finite());
+        require(is_finite, "image.mean", &image.mean, "three finite numbers")?;
+        let is_positive = image.std.iter().all(|x| x.is_finite() && *x > 0.0);
+        require(is_positive, "image.std", &image.std, "three numbers above 0")?;
         let fits = image.windows.len() <= 4 && image.windows.iter().all(|size| (1..=8).contains(size));
-        require(fits, "image.windows", format!("{:?}", image.windows), "at most 4 numbers from 1 to 8")?;
+        require(fits, "image.windows", &image.windows, "at most 4 numbers from 1 to 8")?;
         if let Some(PatchDescription { patch_px, .. }) = image.patches {
             let fits = (1..=image.size_px).contains(&patch_px)
                 && image.size_px.is_multiple_of(patch_px)
                 && image.size_px / patch_px <= MAX_PATCHES_PER_SIDE;
             let expected = "a divisor of image.size_px that gives at most 256 patches a side";
-            require(fits, "image.patches.patch_px", patch_px.to_string(), expected)?;
+            require(fits, "image.patches.patch_px", &patch_px, expected)?;
         }
         if let TextDescription::Onnx(text) = &self.text {
             let max_tokens = text.max_tokens;
-            require(max_tokens >= 2, "text.max_tokens", max_tokens.to_string(), "2 or more")?;
-            let has_place = text.prompt.contains("{}");
-            require(has_place, "text.prompt", format!("{:?}", text.prompt), "a text with {} in it")?;
+            require(max_tokens >= 2, "text.max_tokens", &max_tokens, "2 or more")?;
+            require(text.prompt.contains("{}"), "text.prompt", &text.prompt, "a text with {} in it")?;
             let n_padded = text.padding.map_or(max_tokens, |padding| padding.n_tokens);
             let expected = "text.max_tokens or more";
-            require(n_padded >= max_tokens, "text.padding.n_tokens", n_padded.to_string(), expected)?;
+            require(n_padded >= max_tokens, "text.padding.n_tokens", &n_padded, expected)?;
         }
-        if let Some(score) = &self.score {
-            require(
-                score.threshold().is_some(),
-                "score",
-                format!("{{ {score} }}"),
-                "a threshold alone, a cosine from -1 to 1, or logit_scale above 0 and logit_bias, with a probability \
-                 between 0 and 1 that some cosine reaches",
-            )?;
-        }
-        Ok(())
+        let Some(score) = &self.score else { return Ok(()) };
+        let expected = "a threshold alone, a cosine from -1 to 1, or logit_scale above 0 and logit_bias, with a \
+                        probability between 0 and 1 that some cosine reaches";
+        require(score.threshold().is_some(), "score", &format_args!("{{ {score} }}"), expected)
     }
 }
 
-pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, DescriptionError> {
+pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, ModelError> {
     parse_toml(path, &read_text(path)?)
 }
 
-pub(crate) fn read_text(path: &Path) -> Result<String, DescriptionError> {
+pub(crate) fn read_text(path: &Path) -> Result<String, ModelError> {
     let text = files::open(path).and_then(std::io::read_to_string);
-    text.map_err(|cause| DescriptionError::Read { cause })
+    text.map_err(|cause| ModelError::unreadable(&cause))
 }
 
-fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, DescriptionError> {
-    toml::from_str(text)
-        .map_err(|cause| DescriptionError::Format { path: path.to_owned(), cause: Box::new(cause) })
+fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, ModelError> {
+    let advice = format!("see the fields of {FILE_NAME} in its documentation");
+    toml::from_str(text).map_err(|cause| ModelError::at(path, format_args!("{cause}; {advice}")))
 }
 
 /// Fails unless `holds`: field `field` is `found`, but should be `expected`.
 pub(crate) fn require(
     path: &Path,
     holds: bool,
-    field: &'static str,
-    found: String,
-    expected: &'static str,
-) -> Result<(), DescriptionError> {
-    if holds {
-        return Ok(());
+    field: &str,
+    found: &dyn Debug,
+    expected: &str,
+) -> Result<(), ModelError> {
+    match holds {
+        true => Ok(()),
+        false => {
+            Err(ModelError::at(path, format_args!("{field} is {found:?}, expected {expected}; correct it")))
+        }
     }
-    Err(DescriptionError::Value { path: path.to_owned(), field, found, expected })
 }
 
 /// Checks what all descriptions have: a name, and files below a root.
@@ -375,20 +344,26 @@ pub(crate) fn check_common(
     name: &str,
     files_root: &Path,
     files: &[(&'static str, &FileRef)],
-) -> Result<(), DescriptionError> {
+) -> Result<(), ModelError> {
     let plain_name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
     let is_plain = (1..=64).contains(&name.len()) && name.chars().all(plain_name);
-    require(path, is_plain, "name", format!("{name:?}"), "1 to 64 of A-Z a-z 0-9 - _ .")?;
+    require(path, is_plain, "name", &name, "1 to 64 of A-Z a-z 0-9 - _ .")?;
     let is_relative = files_root
         .components()
         .all(|c| matches!(c, Component::Normal(_) | Component::CurDir | Component::ParentDir));
-    require(path, is_relative, "files_root", files_root.display().to_string(), "a relative path")?;
+    require(path, is_relative, "files_root", &format_args!("{}", files_root.display()), "a relative path")?;
     for (role, file) in files {
         let mut components = file.path.components().peekable();
         let is_below = components.peek().is_some() && components.all(|c| matches!(c, Component::Normal(_)));
-        require(path, is_below, role, file.path.display().to_string(), "a relative path without ..")?;
+        require(
+            path,
+            is_below,
+            role,
+            &format_args!("{}", file.path.display()),
+            "a relative path without ..",
+        )?;
         let is_flat = file.data.as_ref().is_none_or(|data| data.data.is_none());
-        require(path, is_flat, role, "data of data".to_owned(), "weights in one file")?;
+        require(path, is_flat, role, &format_args!("data of data"), "weights in one file")?;
     }
     Ok(())
 }

@@ -25,15 +25,6 @@ impl FileRef {
     pub fn parts(&self) -> impl Iterator<Item = &Self> {
         std::iter::successors(Some(self), |file| file.data.as_deref())
     }
-
-    /// Mutable [`Self::parts`], one after the other.
-    pub(crate) fn for_each_part<E>(
-        &mut self,
-        mut run: impl FnMut(&mut Self) -> Result<(), E>,
-    ) -> Result<(), E> {
-        run(self)?;
-        self.data.as_deref_mut().map_or(Ok(()), run)
-    }
 }
 
 /// Only the hashes: the encoder id must not depend on paths.

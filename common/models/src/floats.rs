@@ -113,12 +113,6 @@ impl Clone for Floats {
     }
 }
 
-impl PartialEq for Floats {
-    fn eq(&self, other: &Self) -> bool {
-        **self == **other
-    }
-}
-
 impl Debug for Floats {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         (**self).fmt(f)

@@ -17,7 +17,7 @@ use crate::{
     placement::DeviceMemory,
     placement::Placement,
     preprocess::Preprocess,
-    session::{Model, SessionError, SessionOptions},
+    session::{Model, SessionOptions},
 };
 
 /// Largest deviation from length 1 of vectors that the model normalises itself.
@@ -111,7 +111,7 @@ impl OnnxImageEncoder {
     }
 
     /// Runs batches through this memory from now on.
-    fn bind(&mut self, memory: DeviceMemory, options: &SessionOptions) -> Result<(), SessionError> {
+    fn bind(&mut self, memory: DeviceMemory, options: &SessionOptions) -> Result<(), ModelError> {
         let batch = *self.batch.get_or_insert(GPU_BATCH);
         let levels = Levels::open(batch, &self.preprocess, self.is_f16, &memory, options)?;
         self.on_gpu = Some(OnGpu { memory, levels, turns: Turns::of(options.gpu) });
@@ -119,7 +119,7 @@ impl OnnxImageEncoder {
     }
 
     /// Sets a batch size that the description leaves open to `measured`, which is measured if absent.
-    pub(crate) fn settle_batch(&mut self, measured: &mut Option<usize>) -> Result<(), SessionError> {
+    pub(crate) fn settle_batch(&mut self, measured: &mut Option<usize>) -> Result<(), ModelError> {
         if self.batch.is_none() {
             self.batch = Some(match *measured {
                 Some(batch) => batch,
@@ -129,7 +129,7 @@ impl OnnxImageEncoder {
         Ok(())
     }
 
-    fn measure_batch(&mut self) -> Result<usize, SessionError> {
+    fn measure_batch(&mut self) -> Result<usize, ModelError> {
         let n_values = 3 * (self.preprocess.size_px() as usize).pow(2);
         // Noise of two strengths, between which scales computed at run time differ.
         let mut state = 1u32;
@@ -143,7 +143,7 @@ impl OnnxImageEncoder {
         let (weak, strong) = (noise(0.5), noise(2.0));
         let alone = self.run(&weak, 1)?;
         let dim = self.dim;
-        let mut timed = |batch: usize| -> Result<(Duration, bool), SessionError> {
+        let mut timed = |batch: usize| -> Result<(Duration, bool), ModelError> {
             let crop = |i: usize| if i == 0 || i + 1 == batch { &weak } else { &strong };
             let pixels: Vec<f32> = (0..batch).flat_map(crop).copied().collect();
             let start = Instant::now();
@@ -169,7 +169,7 @@ impl OnnxImageEncoder {
     }
 
     /// Vectors of at most a batch of crops, `[n][dim]`.
-    fn vectors(&mut self, crops: &[Crop]) -> Result<Vec<f32>, SessionError> {
+    fn vectors(&mut self, crops: &[Crop]) -> Result<Vec<f32>, ModelError> {
         let Some(OnGpu { memory, levels, turns }) = &mut self.on_gpu else {
             let mut pixels = Vec::new();
             for crop in crops {
@@ -192,7 +192,7 @@ impl OnnxImageEncoder {
     }
 
     /// Runs the model on `[n][3][size_px][size_px]`; returns its vectors, `[n][dim]`.
-    fn run(&mut self, pixels: &[f32], n: usize) -> Result<Vec<f32>, SessionError> {
+    fn run(&mut self, pixels: &[f32], n: usize) -> Result<Vec<f32>, ModelError> {
         let (output, dim) = (self.output.clone(), self.dim as i64);
         self.run_for(pixels, n, &output, &[n as i64, dim])
     }
@@ -204,7 +204,7 @@ impl OnnxImageEncoder {
         n: usize,
         output: &str,
         shape: &[i64],
-    ) -> Result<Vec<f32>, SessionError> {
+    ) -> Result<Vec<f32>, ModelError> {
         let size = i64::from(self.preprocess.size_px());
         let input_shape = vec![n as i64, 3, size, size];
         let halves: Vec<f16>;

@@ -7,12 +7,12 @@ use half::f16;
 use image::RgbImage;
 use ort::value::DynTensor;
 
-use crate::ModelFile;
 use crate::bound::Place;
 use crate::floats::bytes_mut;
 use crate::placement::DeviceMemory;
 use crate::preprocess::Preprocess;
-use crate::session::{Model, SessionError, SessionOptions};
+use crate::session::{Model, SessionOptions};
+use crate::{ModelError, ModelFile};
 
 /// Made by `embedded/levels.py`.
 const F16: &[u8] = include_bytes!("../embedded/levels_f16.onnx");
@@ -40,7 +40,7 @@ impl Levels {
         is_f16: bool,
         memory: &DeviceMemory,
         options: &SessionOptions,
-    ) -> Result<Self, SessionError> {
+    ) -> Result<Self, ModelError> {
         let (name, bytes) = if is_f16 { ("levels_f16.onnx", F16) } else { ("levels_f32.onnx", F32) };
         let model = Model::open(&ModelFile::embedded(Path::new(name), bytes), options)?;
         let size = i64::from(preprocess.size_px());
@@ -61,8 +61,8 @@ impl Levels {
         &mut self,
         memory: &DeviceMemory,
         squares: impl Iterator<Item = std::borrow::Cow<'a, RgbImage>>,
-    ) -> Result<DynTensor, SessionError> {
-        let failed = |cause| SessionError::Run { path: self.model.path.clone(), cause };
+    ) -> Result<DynTensor, ModelError> {
+        let failed = |cause| self.model.run_error(cause);
         let (places, square_bytes) = (bytes_mut(&mut self.squares).map_err(failed)?, self.square_bytes);
         let squares: Vec<_> = squares.collect();
         let n_of_thread = squares.len().div_ceil(N_THREADS).max(1);

@@ -20,7 +20,7 @@ mod embedded {
 
 use crate::{
     EncoderId, ImageEncoder, ModelError, ModelFile, SessionOptions, TextEncoder, colours,
-    description::{self, Description, DescriptionError, FILE_NAME, FileRef, TextDescription},
+    description::{self, Description, FILE_NAME, FileRef, TextDescription},
     image::OnnxImageEncoder,
     phrases::PhraseEncoder,
     preprocess::Preprocess,
@@ -33,51 +33,46 @@ use crate::{
 #[derive(Clone, Debug)]
 pub struct ModelDir {
     id: EncoderId,
-    source: Source,
+    /// `None` for the stand-in of colours.
+    files: Option<Files>,
 }
 
 #[derive(Clone, Debug)]
-enum Source {
-    Colours,
-    Files { files: Files, description: Box<Documented>, batch: Arc<Mutex<Option<usize>>> },
-}
-
-#[derive(Clone, Debug)]
-struct Documented {
-    /// TOML; empty for a model from a store, which cannot encode images.
-    document: String,
+struct Files {
     description: Description,
-}
-
-impl std::ops::Deref for Documented {
-    type Target = Description;
-
-    fn deref(&self) -> &Description {
-        &self.description
-    }
-}
-
-#[derive(Clone, Debug)]
-enum Files {
-    Embedded,
-    Folder(PathBuf),
+    /// Its TOML; empty for a model from a store, which cannot encode images.
+    document: String,
+    /// `None` for the embedded encoders.
+    root: Option<PathBuf>,
+    /// Batch size of images, once it is measured.
+    batch: Arc<Mutex<Option<usize>>>,
 }
 
 impl Files {
     /// Returns a file, checked against its hash if recorded; `embedded`: its compiled-in bytes.
-    fn open(&self, file: &FileRef, embedded: &'static [u8]) -> Result<ModelFile, DescriptionError> {
-        match self {
-            Self::Embedded => Ok(ModelFile::embedded(&file.path, embedded)),
-            Self::Folder(root) => Ok(checked(root, file)?.into()),
+    fn open(&self, file: &FileRef, embedded: &'static [u8]) -> Result<ModelFile, ModelError> {
+        match &self.root {
+            None => Ok(ModelFile::embedded(&file.path, embedded)),
+            Some(root) => Ok(checked(root, file)?.into()),
         }
     }
 
     /// Returns the path of a file that embedded models do not have.
-    fn on_disk(&self, file: &FileRef) -> Result<PathBuf, DescriptionError> {
-        match self {
-            Self::Embedded => Ok(file.path.clone()),
-            Self::Folder(root) => checked(root, file),
+    fn on_disk(&self, file: &FileRef) -> Result<PathBuf, ModelError> {
+        self.root.as_ref().map_or(Ok(file.path.clone()), |root| checked(root, file))
+    }
+
+    /// The description with the hash of each file; the embedded one records them all.
+    fn hashed(&self) -> Result<Description, ModelError> {
+        let mut hashed = self.description.clone();
+        let root = self.root.as_deref().unwrap_or(Path::new(""));
+        for file in hashed.files_mut() {
+            file.sha256 = Some(description::Sha256(sha256_of(root, file)?));
+            if let Some(data) = &mut file.data {
+                data.sha256 = Some(description::Sha256(sha256_of(root, data)?));
+            }
         }
+        Ok(hashed)
     }
 }
 
@@ -88,49 +83,46 @@ impl ModelDir {
         let file = path.join(FILE_NAME);
         let document = description::read_text(&file)?;
         let description = Description::parse(&file, &document)?;
-        let files_root = path.join(&description.files_root);
-        Self::with(Documented { document, description }, Files::Folder(files_root))
+        let root = path.join(&description.files_root);
+        Self::with(description, document, Some(root))
     }
 
     /// The embedded encoders: trained on generated scenes, poor on real photos (`embedded/CARD.md`); need ONNX Runtime.
     pub fn embedded() -> Result<Self, ModelError> {
         let description = Description::parse(Path::new("(embedded)/model.toml"), embedded::DESCRIPTION)?;
-        Self::with(Documented { document: embedded::DESCRIPTION.to_owned(), description }, Files::Embedded)
+        Self::with(description, embedded::DESCRIPTION.to_owned(), None)
     }
 
     /// Opens the text side from a store. `description`: [`TextSide::description`]; `path`: of the description, for
     /// messages; `folder`: has its files, named by hash. Their content is checked when the encoder is opened.
     pub fn carried(description: &[u8], path: &Path, folder: &Path) -> Result<Self, ModelError> {
-        let description = Description::from_json(path, description)?;
-        let described = Documented { document: String::new(), description };
-        Self::with(described, Files::Folder(folder.to_owned()))
+        Self::with(Description::from_json(path, description)?, String::new(), Some(folder.to_owned()))
     }
 
     pub fn text_side(&self) -> Result<TextSide, TextSideError> {
-        let built_in = || TextSideError::BuiltIn { model: self.id.name.clone() };
-        let Source::Files { files: files @ Files::Folder(root), description, .. } = &self.source else {
-            return Err(built_in());
+        let Some(files) = self.files.as_ref().filter(|files| files.root.is_some()) else {
+            return Err(TextSideError(format!(
+                "{} is part of every robot's program, so a store need not carry it; leave --text-model out",
+                self.id.name
+            )));
         };
-        let hashed = hashed(&description.description, root)?;
-        TextSide::new(&self.id, &description.document, &hashed, |file| files.open(file, &[]))
+        TextSide::new(&self.id, &files.document, &files.hashed()?, |file| files.open(file, &[]))
     }
 
-    fn with(description: Documented, files: Files) -> Result<Self, ModelError> {
-        let root = match &files {
-            Files::Folder(root) => root,
-            // Unused: the embedded description records every hash.
-            Files::Embedded => Path::new(""),
-        };
-        let id = hashed(&description.description, root)?.encoder_id();
-        let source = Source::Files { files, description: Box::new(description), batch: Arc::default() };
-        Ok(Self { id, source })
+    fn with(description: Description, document: String, root: Option<PathBuf>) -> Result<Self, ModelError> {
+        let files = Files { description, document, root, batch: Arc::default() };
+        Ok(Self { id: files.hashed()?.encoder_id(), files: Some(files) })
     }
 
     /// The stand-in for colours and shapes, which needs no files and no ONNX Runtime.
     pub fn colours() -> Self {
         let id =
             EncoderId { name: colours::NAME.to_owned(), dim: colours::DIM as u32, definition: String::new() };
-        Self { id, source: Source::Colours }
+        Self { id, files: None }
+    }
+
+    fn description(&self) -> Option<&Description> {
+        self.files.as_ref().map(|files| &files.description)
     }
 
     pub fn encoder_id(&self) -> &EncoderId {
@@ -143,62 +135,47 @@ impl ModelDir {
 
     /// What the model can recognise and what not, for people.
     pub fn about(&self) -> &str {
-        match &self.source {
-            Source::Colours => colours::ABOUT,
-            Source::Files { description, .. } => &description.about,
-        }
+        self.description().map_or(colours::ABOUT, |description| &description.about)
     }
 
     /// Least cosine of a match, if the model states one.
     pub fn threshold(&self) -> Option<f32> {
-        match &self.source {
-            Source::Colours => Some(colours::THRESHOLD),
-            Source::Files { description, .. } => description.score.as_ref()?.threshold(),
+        match self.description() {
+            None => Some(colours::THRESHOLD),
+            Some(description) => description.score.as_ref()?.threshold(),
         }
     }
 
     /// Steps from a crop to the image encoder's square, which has the same vector; `None` if any size is accepted.
     pub fn preprocess(&self) -> Option<Preprocess> {
-        match &self.source {
-            Source::Colours => None,
-            Source::Files { description, .. } => Some(description.image.preprocess()),
-        }
+        self.description().map(|description| description.image.preprocess())
     }
 
     /// Patches with vectors along each side of a photo; `None` without any.
     pub fn patches_per_side(&self) -> Option<u32> {
-        match &self.source {
-            Source::Colours => None,
-            Source::Files { description, .. } => description.image.patches_per_side(),
-        }
+        self.description()?.image.patches_per_side()
     }
 
     /// Sizes of windows of a photo that masks take a share of; empty if the model should see objects alone.
     pub fn windows(&self) -> &[u8] {
-        match &self.source {
-            Source::Colours => &[],
-            Source::Files { description, .. } => &description.image.windows,
-        }
+        self.description().map_or(&[], |description| &description.image.windows)
     }
 
     pub fn image_encoder(&self, options: &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError> {
-        let Source::Files { files, description, batch } = &self.source else {
-            return Ok(Box::new(colours::ColourShape));
-        };
-        let image = &description.image;
+        let Some(files) = &self.files else { return Ok(Box::new(colours::ColourShape)) };
+        let Description { name, image, .. } = &files.description;
         let file = files.open(&image.file, embedded::IMAGE)?;
-        let mut encoder = OnnxImageEncoder::open(&description.name, self.dim(), &file, image, options)?;
+        let mut encoder = OnnxImageEncoder::open(name, self.dim(), &file, image, options)?;
         // One encoder measures while others wait, because parallel runs would disturb the timing.
-        encoder.settle_batch(&mut batch.lock().unwrap_or_else(PoisonError::into_inner))?;
+        encoder.settle_batch(&mut files.batch.lock().unwrap_or_else(PoisonError::into_inner))?;
         Ok(Box::new(encoder))
     }
 
     /// Loads ONNX Runtime only if the text side is ONNX.
     pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
-        let Source::Files { files, description, .. } = &self.source else {
-            return Ok(Box::new(colours::ColourShape));
-        };
-        let (name, dim) = (&description.name, self.dim());
+        let Some(files) = &self.files else { return Ok(Box::new(colours::ColourShape)) };
+        let (description, dim) = (&files.description, self.dim());
+        let name = &description.name;
         let centre = match &description.text_centre {
             None => None,
             Some(centre) => Some(tensors::read(&files.on_disk(&centre.file)?, &centre.tensor, None, dim)?),
@@ -208,9 +185,9 @@ impl ModelDir {
                 let model = files.open(&text.file, embedded::TEXT)?;
                 let tokenizer = files.open(&text.tokenizer, embedded::TOKENIZER)?;
                 let encoder = OnnxTextEncoder::open(name, dim, [&model, &tokenizer], text, centre, options)?;
-                Box::new(match files {
-                    Files::Embedded => encoder.with_words(embedded::NOUNS.lines(), embedded::KINDS.lines()),
-                    _ => encoder,
+                Box::new(match files.root {
+                    None => encoder.with_words(embedded::NOUNS.lines(), embedded::KINDS.lines()),
+                    Some(_) => encoder,
                 })
             }
             TextDescription::Phrases(text) => {
@@ -221,41 +198,41 @@ impl ModelDir {
     }
 }
 
-fn hashed(description: &Description, root: &Path) -> Result<Description, DescriptionError> {
-    let mut hashed = description.clone();
-    for file in hashed.files_mut() {
-        file.for_each_part(|part| {
-            part.sha256 = Some(crate::description::Sha256(sha256_of(root, part)?));
-            Ok::<_, DescriptionError>(())
-        })?;
-    }
-    Ok(hashed)
-}
-
 /// Returns the recorded hash, or computes it.
-pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], DescriptionError> {
+pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], ModelError> {
     let path = files_root.join(&file.path);
     match file.sha256 {
         Some(sha256) => Ok(sha256.0),
         None => hash_file(&path).map_err(|cause| match cause.kind() {
-            io::ErrorKind::NotFound => DescriptionError::NoHash { path },
-            _ => DescriptionError::Read { cause },
+            io::ErrorKind::NotFound => {
+                let fault = format!("absent, and {FILE_NAME} records no sha256 for it");
+                ModelError::at(&path, format_args!("{fault}; record it or put the file there"))
+            }
+            _ => ModelError::unreadable(&cause),
         }),
     }
 }
 
 /// Returns the path of `file`, checked with its weights against recorded hashes.
-pub(crate) fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionError> {
+pub(crate) fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, ModelError> {
     for part in file.parts() {
         let path = files_root.join(&part.path);
         let Some(expected) = part.sha256 else { continue };
-        let found = hash_file(&path).map_err(|cause| DescriptionError::Read { cause })?;
+        let found = hash_file(&path).map_err(|cause| ModelError::unreadable(&cause))?;
         if found != expected.0 {
-            let (expected, found) = (hex::encode(expected.0), hex::encode(found));
-            return Err(DescriptionError::Hash { path, expected, found });
+            return Err(other_hash(&path, expected, description::Sha256(found)));
         }
     }
     Ok(files_root.join(&file.path))
+}
+
+pub(crate) fn other_hash(
+    path: &Path,
+    expected: description::Sha256,
+    found: description::Sha256,
+) -> ModelError {
+    let advice = "fetch the file again or correct the description";
+    ModelError::at(path, format_args!("SHA-256 is {found}, expected {expected}; {advice}"))
 }
 
 pub(crate) fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
@@ -271,8 +248,8 @@ mod tests {
     fn id_of(description: &str) -> [u8; 32] {
         let description =
             Description::parse(Path::new("model.toml"), description).expect("a valid description");
-        let described = Documented { document: String::new(), description };
-        ModelDir::with(described, Files::Embedded).expect("every hash is recorded").encoder_id().hash()
+        let model = ModelDir::with(description, String::new(), None);
+        model.expect("every hash is recorded").encoder_id().hash()
     }
 
     /// The id depends on everything that affects vectors, and not on texts for people, paths or batch sizes.

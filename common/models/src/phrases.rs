@@ -5,7 +5,7 @@ use std::{collections::HashMap, path::Path, sync::Arc};
 use slag_common::files;
 
 use crate::encoder::TextEncoder;
-use crate::error::{InferenceError, ModelError, PhrasesError};
+use crate::error::{InferenceError, ModelError};
 use crate::synonyms::{KnownPhrases, key, singulars, without_hyphens};
 use crate::{tensors, text::centred};
 
@@ -34,13 +34,15 @@ impl PhraseEncoder {
         centre: Option<Vec<f32>>,
     ) -> Result<Self, ModelError> {
         let text = files::open(phrases).and_then(std::io::read_to_string);
-        let text = text.map_err(|cause| PhrasesError::Read { cause })?;
+        let text = text.map_err(|cause| ModelError::unreadable(&cause))?;
+        let unfit =
+            |index: usize, fault: String| ModelError::at(phrases, format_args!("line {}{fault}", index + 1));
         let lines: Vec<String> = text.lines().map(str::to_owned).collect();
         let mut index_of_key = HashMap::new();
         for (index, phrase) in lines.iter().enumerate() {
             let key = key(phrase);
             if key.is_empty() {
-                return Err(PhrasesError::EmptyLine { path: phrases.to_owned(), line: index + 1 }.into());
+                return Err(unfit(index, " is empty; the list needs one phrase a line".into()));
             }
             index_of_key.entry(key).or_insert(index);
         }
@@ -52,8 +54,9 @@ impl PhraseEncoder {
         let mut vectors = tensors::read(vectors, tensor, Some(lines.len()), dim)?;
         for (index, vector) in vectors.chunks_exact_mut(dim).enumerate() {
             if !centred(vector, centre.as_deref()) {
-                let (path, phrase) = (phrases.to_owned(), lines[index].clone());
-                return Err(PhrasesError::NoDirection { path, line: index + 1, phrase }.into());
+                let phrase = &lines[index];
+                let fault = format!(": the vector of {phrase:?} is zero after centring; remove the phrase");
+                return Err(unfit(index, fault));
             }
         }
         let known = Arc::new(KnownPhrases::new(index_of_key.keys().cloned(), true));

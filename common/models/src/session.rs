@@ -16,12 +16,13 @@ use ort::value::{
 };
 use slag_common::files;
 
+use crate::ModelError;
 use crate::file_ref::ModelFile;
 use crate::floats::Floats;
 use crate::placement::{DeviceMemory, Listener, Placement, forward_log};
 use crate::provider::{Provider, names};
 
-pub use crate::error::SessionError;
+pub use crate::error::ModelError as SessionError;
 
 #[derive(Clone, Debug)]
 pub struct SessionOptions {
@@ -57,7 +58,7 @@ fn warn_once(message: String) {
 }
 
 /// A tensor of f32, row-major.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Debug, Default)]
 pub(crate) struct Tensor {
     pub(crate) shape: Vec<i64>,
     pub(crate) values: Floats,
@@ -79,6 +80,9 @@ pub(crate) fn listed(outlets: &[Outlet]) -> Vec<String> {
     outlets.iter().map(|outlet| format!("{} {}", outlet.name(), type_of(outlet))).collect()
 }
 
+/// The inner error is a provider that cannot be used.
+type Committed = Result<(Session, Placement), (Provider, ort::Error)>;
+
 #[derive(Debug)]
 pub(crate) struct Model {
     pub(crate) path: PathBuf,
@@ -96,7 +100,7 @@ pub(crate) struct Slot {
 }
 
 impl Model {
-    pub(crate) fn open(file: &ModelFile, options: &SessionOptions) -> Result<Self, SessionError> {
+    pub(crate) fn open(file: &ModelFile, options: &SessionOptions) -> Result<Self, ModelError> {
         Self::open_sized(file, options, None)
     }
 
@@ -105,11 +109,11 @@ impl Model {
         file: &ModelFile,
         options: &SessionOptions,
         size: Option<(&str, i64)>,
-    ) -> Result<Self, SessionError> {
+    ) -> Result<Self, ModelError> {
         let path = &*file.path;
         // Checked before the library is loaded, so that a missing model is reported as such.
         if file.embedded.is_none() {
-            files::metadata(path).map_err(|cause| SessionError::Read { cause })?;
+            files::metadata(path).map_err(|cause| ModelError::unreadable(&cause))?;
         }
         let environment = environment(&options.runtime)?;
         let mut wanted = options.providers.clone();
@@ -119,31 +123,38 @@ impl Model {
         wanted.truncate(end.unwrap_or(wanted.len()));
         let asked = wanted.clone();
         let (session, placement) = loop {
-            match Self::commit(file, options, &environment, (&wanted, !asked.is_empty()), size) {
-                Err(SessionError::Provider { provider, cause }) => {
-                    wanted.retain(|&p| p != provider);
-                    let error = SessionError::Provider { provider, cause };
-                    if wanted.is_empty() && !may_be_cpu {
-                        return Err(error);
-                    }
-                    warn_once(error.to_string());
-                }
-                committed => break committed?,
+            let committed = Self::commit(file, options, &environment, (&wanted, !asked.is_empty()), size)?;
+            let (provider, cause) = match committed {
+                Ok(committed) => break committed,
+                Err(refused) => refused,
+            };
+            wanted.retain(|&p| p != provider);
+            let refusal = format!(
+                "ONNX Runtime cannot use {provider}: {cause}; install its drivers and a libonnxruntime built with it \
+                 (onnxruntime-gpu for cuda and tensorrt), or allow the CPU as well: {provider},cpu"
+            );
+            if wanted.is_empty() && !may_be_cpu {
+                return Err(ModelError(refusal));
             }
+            warn_once(refusal);
         };
         let placement = placement.of_asked(&asked);
         if placement.provider() == Provider::Cpu && !asked.is_empty() {
-            if !may_be_cpu {
-                return Err(SessionError::NotPlaced { path: path.to_owned(), asked, placement });
-            }
             let asked = names(&asked);
+            if !may_be_cpu {
+                let fault = format!(
+                    "runs on {placement} only, but {asked} is requested; use another export of the model, or add cpu to \
+                     allow the CPU as well"
+                );
+                return Err(ModelError::at(path, fault));
+            }
             warn_once(format!("{} runs on the CPU instead of {asked}", path.display()));
         }
         tracing::debug!("{} runs on {placement}", path.display());
         let memory = matches!(placement.provider(), Provider::Cuda | Provider::TensorRt)
             .then(|| DeviceMemory::of_gpu(&session, options.gpu))
             .transpose()
-            .map_err(|cause| SessionError::Load { path: path.to_owned(), cause })?;
+            .map_err(|cause| unloadable(path, &cause))?;
         Ok(Self { path: path.to_owned(), session, placement, memory })
     }
 
@@ -154,15 +165,8 @@ impl Model {
         environment: &Environment,
         (providers, listens): (&[Provider], bool),
         size: Option<(&str, i64)>,
-    ) -> Result<(Session, Placement), SessionError> {
-        let load = |cause: ort::Error| {
-            let says = cause.message();
-            let path = file.path.clone();
-            match says.contains("opset") || says.contains("IR version") {
-                true => SessionError::Version { path, cause },
-                false => SessionError::Load { path, cause },
-            }
-        };
+    ) -> Result<Committed, ModelError> {
+        let load = |cause: ort::Error| unloadable(&file.path, &cause);
         let mut builder = Session::builder(environment)
             .and_then(|b| b.with_intra_threads(options.intra_op_threads).map_err(ort::Error::from))
             .and_then(|b| b.with_inter_threads(1).map_err(ort::Error::from))
@@ -179,26 +183,31 @@ impl Model {
             builder = listener.attach(builder).map_err(load)?;
         }
         for &provider in providers {
-            builder = provider
-                .register(builder, options.gpu)
-                .map_err(|cause| SessionError::Provider { provider, cause })?;
+            builder = match provider.register(builder, options.gpu) {
+                Ok(builder) => builder,
+                Err(cause) => return Ok(Err((provider, cause))),
+            };
         }
         let committed = match file.embedded {
             Some(bytes) => builder.commit_from_memory(bytes),
             None => builder.commit_from_file(&file.path),
         };
-        let session = committed.map_err(|cause| match (providers.first(), cause.code()) {
+        let cause = match committed {
+            Ok(session) => return Ok(Ok((session, listener.placement()))),
+            Err(cause) => cause,
+        };
+        match (providers.first(), cause.code()) {
             (None, _) | (_, ErrorCode::InvalidProtobuf | ErrorCode::InvalidGraph | ErrorCode::NoModel) => {
-                load(cause)
+                Err(load(cause))
             }
             // The runtime looks for devices and drivers only here.
-            (Some(&provider), _) => SessionError::Provider { provider, cause },
-        })?;
-        Ok((session, listener.placement()))
+            (Some(&provider), _) => Ok(Err((provider, cause))),
+        }
     }
 
-    pub(crate) fn run_error(&self, cause: ort::Error) -> SessionError {
-        SessionError::Run { path: self.path.clone(), cause }
+    pub(crate) fn run_error(&self, cause: ort::Error) -> ModelError {
+        let advice = "check that the file fits its description";
+        ModelError::at(&self.path, format_args!("the model fails to run: {cause}; {advice}"))
     }
 
     /// The name of a dimension of any size of input `name`.
@@ -222,7 +231,7 @@ impl Model {
         name: impl Into<Option<&'a str>>,
         element: TensorElementType,
         shape: &[i64],
-    ) -> Result<Slot, SessionError> {
+    ) -> Result<Slot, ModelError> {
         self.expect("input", self.session.inputs(), name.into(), element, shape)
     }
 
@@ -232,21 +241,16 @@ impl Model {
         name: impl Into<Option<&'a str>>,
         element: TensorElementType,
         shape: &[i64],
-    ) -> Result<Slot, SessionError> {
+    ) -> Result<Slot, ModelError> {
         self.expect("output", self.session.outputs(), name.into(), element, shape)
     }
 
-    pub(crate) fn expect_no_input_but(&self, names: &[&str]) -> Result<(), SessionError> {
-        match self.session.inputs().iter().find(|input| !names.contains(&input.name())) {
-            None => Ok(()),
-            Some(input) => Err(SessionError::Shape {
-                path: self.path.clone(),
-                role: "input",
-                name: input.name().to_owned(),
-                found: "required by the model".to_owned(),
-                expected: format!("only {}", names.join(", ")),
-            }),
-        }
+    pub(crate) fn expect_no_input_but(&self, names: &[&str]) -> Result<(), ModelError> {
+        let other = self.session.inputs().iter().find(|input| !names.contains(&input.name()));
+        other.map_or(Ok(()), |input| {
+            let expected = format!("only {}", names.join(", "));
+            Err(self.shape_error("input", input.name(), "required by the model", &expected))
+        })
     }
 
     fn expect(
@@ -256,7 +260,7 @@ impl Model {
         name: Option<&str>,
         element: TensorElementType,
         expected: &[i64],
-    ) -> Result<Slot, SessionError> {
+    ) -> Result<Slot, ModelError> {
         let slot_of = |outlet: &Outlet| match outlet.dtype() {
             ValueType::Tensor { ty, shape, .. }
                 if is_element(*ty, element) && shapes_fit(shape, expected) =>
@@ -265,59 +269,46 @@ impl Model {
             }
             _ => None,
         };
-        let path = self.path.clone();
+        let wanted = format!("{element} {expected:?}");
         let Some(name) = name else {
             let mut fitting = outlets.iter().filter_map(slot_of);
             return match (fitting.next(), fitting.next()) {
                 (Some(slot), None) => Ok(slot),
-                _ => Err(SessionError::Unnamed {
-                    path,
-                    role,
-                    found: listed(outlets),
-                    expected: format!("{element} {expected:?}"),
-                }),
+                _ => {
+                    let found = listed(outlets).join(", ");
+                    let fault = format!(
+                        "the description names no {role}, and not exactly one of {found} is {wanted}; name it in the \
+                         description"
+                    );
+                    Err(ModelError::at(&self.path, fault))
+                }
             };
         };
         let Some(outlet) = outlets.iter().find(|outlet| outlet.name() == name) else {
-            let found = outlets.iter().map(|outlet| outlet.name().to_owned()).collect();
-            return Err(SessionError::NoTensor { path, role, name: name.to_owned(), found });
+            let found = outlets.iter().map(Outlet::name).collect::<Vec<_>>().join(", ");
+            let fault = format!("no {role} {name:?}, it has {found}; correct the description");
+            return Err(ModelError::at(&self.path, fault));
         };
-        slot_of(outlet).ok_or_else(|| self.shape_error(role, name, type_of(outlet), element, expected))
+        slot_of(outlet).ok_or_else(|| self.shape_error(role, name, &type_of(outlet), &wanted))
     }
 
     /// The error of a model that takes only one length of text.
-    pub(crate) fn fixed_tokens(&self, slot: &Slot) -> SessionError {
+    pub(crate) fn fixed_tokens(&self, slot: &Slot) -> ModelError {
         let n = slot.shape[1];
-        SessionError::Shape {
-            path: self.path.clone(),
-            role: "input",
-            name: slot.name.clone(),
-            found: format!("{} {:?}", slot.element, slot.shape),
-            expected: format!(
-                "text.padding = {{ n_tokens = {n}, token_id = the model's }}, or a model with any number of tokens"
-            ),
-        }
+        let expected = format!(
+            "text.padding = {{ n_tokens = {n}, token_id = the model's }}, or a model with any number of tokens"
+        );
+        self.shape_error("input", &slot.name, &format!("{} {:?}", slot.element, slot.shape), &expected)
     }
 
-    fn shape_error(
-        &self,
-        role: &'static str,
-        name: &str,
-        found: String,
-        element: TensorElementType,
-        expected: &[i64],
-    ) -> SessionError {
-        SessionError::Shape {
-            path: self.path.clone(),
-            role,
-            name: name.to_owned(),
-            found,
-            expected: format!("{element} {expected:?}"),
-        }
+    fn shape_error(&self, role: &str, name: &str, found: &str, expected: &str) -> ModelError {
+        let fault = format_args!("{role} {name:?} is {found}, expected {expected}; correct the description");
+        ModelError::at(&self.path, fault)
     }
 
-    pub(crate) fn layout_error(&self, found: String, expected: String) -> SessionError {
-        SessionError::Layout { path: self.path.clone(), found, expected }
+    pub(crate) fn layout_error(&self, found: &str, expected: &str) -> ModelError {
+        let advice = "use the files of one export, each in its field";
+        ModelError::at(&self.path, format_args!("{found}; expected {expected}; {advice}"))
     }
 
     /// Runs the model; returns the f32 output `name`, which must have exactly `shape`.
@@ -326,26 +317,11 @@ impl Model {
         inputs: Vec<(&str, SessionInputValue<'_>)>,
         name: &str,
         shape: &[i64],
-    ) -> Result<Vec<f32>, SessionError> {
-        Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values.into_vec())
-    }
-
-    /// Runs the model; returns f32 outputs in the given order; -1 in a shape is any size.
-    pub(crate) fn run_all(
-        &mut self,
-        inputs: Vec<(&str, SessionInputValue<'_>)>,
-        outputs: &[(&str, &[i64])],
-    ) -> Result<Vec<Tensor>, SessionError> {
-        let mut found =
-            self.session.run(inputs).map_err(|cause| SessionError::Run { path: self.path.clone(), cause })?;
+    ) -> Result<Vec<f32>, ModelError> {
         let tensor = |value: DynValue| value.downcast::<DynTensorValueType>().ok();
-        let values: Vec<_> = outputs.iter().map(|(name, _)| found.remove(name).and_then(tensor)).collect();
-        drop(found);
-        values
-            .into_iter()
-            .zip(outputs)
-            .map(|(value, (name, shape))| self.floats(value, name, shape))
-            .collect()
+        let found = self.session.run(inputs).map(|mut found| found.remove(name).and_then(tensor));
+        let found = found.map_err(|cause| self.run_error(cause))?;
+        Ok(self.floats(found, name, shape)?.values.into_vec())
     }
 
     /// Values of output `name`, f32 or f16, which must fit `shape`; -1 is any size.
@@ -354,13 +330,14 @@ impl Model {
         value: Option<DynTensor>,
         name: &str,
         shape: &[i64],
-    ) -> Result<Tensor, SessionError> {
-        let wrong = |found| self.shape_error("output", name, found, TensorElementType::Float32, shape);
-        let value = value.ok_or_else(|| wrong("absent".to_owned()))?;
+    ) -> Result<Tensor, ModelError> {
+        let of = |shape: &[i64]| format!("{} {shape:?}", TensorElementType::Float32);
+        let wrong = |found: &str| self.shape_error("output", name, found, &of(shape));
+        let value = value.ok_or_else(|| wrong("absent"))?;
         let (found, values) = Floats::of(value).map_err(|cause| self.run_error(cause))?;
         match shapes_fit(&found, shape) {
             true => Ok(Tensor { shape: found, values }),
-            false => Err(wrong(format!("{} {found:?}", TensorElementType::Float32))),
+            false => Err(wrong(&of(&found))),
         }
     }
 
@@ -368,7 +345,7 @@ impl Model {
         &self,
         shape: Vec<i64>,
         values: &'a [T],
-    ) -> Result<SessionInputValue<'a>, SessionError>
+    ) -> Result<SessionInputValue<'a>, ModelError>
     where
         T: PrimitiveTensorElementType + Clone + Debug + 'static,
     {
@@ -376,7 +353,7 @@ impl Model {
         Ok(tensor.into())
     }
 
-    pub(crate) fn owned<T>(&self, shape: Vec<i64>, values: Vec<T>) -> Result<DynTensor, SessionError>
+    pub(crate) fn owned<T>(&self, shape: Vec<i64>, values: Vec<T>) -> Result<DynTensor, ModelError>
     where
         T: PrimitiveTensorElementType + Clone + Debug + 'static,
     {
@@ -390,16 +367,22 @@ impl Model {
         shape: Vec<i64>,
         values: impl Iterator<Item = u32>,
         is_i32: bool,
-    ) -> Result<SessionInputValue<'static>, SessionError> {
-        let tensor: ort::Result<SessionInputValue<'static>> =
-            match is_i32 {
-                true => OwnedTensor::from_array((shape, values.map(|v| v as i32).collect::<Vec<_>>()))
-                    .map(Into::into),
-                false => OwnedTensor::from_array((shape, values.map(i64::from).collect::<Vec<_>>()))
-                    .map(Into::into),
-            };
-        tensor.map_err(|cause| self.run_error(cause))
+    ) -> Result<SessionInputValue<'static>, ModelError> {
+        Ok(match is_i32 {
+            true => self.owned(shape, values.map(|v| v as i32).collect())?,
+            false => self.owned(shape, values.map(i64::from).collect())?,
+        }
+        .into())
     }
+}
+
+fn unloadable(path: &Path, cause: &ort::Error) -> ModelError {
+    let says = cause.message();
+    let advice = match says.contains("opset") || says.contains("IR version") {
+        true => "give a newer libonnxruntime, or export the model for an older opset (all support 17)",
+        false => "fetch the model file again",
+    };
+    ModelError::at(path, format_args!("{cause}; {advice}"))
 }
 
 fn type_of(outlet: &Outlet) -> String {
@@ -422,27 +405,29 @@ pub(crate) fn shapes_fit(declared: &[i64], expected: &[i64]) -> bool {
 
 /// Path of the library: `explicit`, else in the first of the folders `beside` that has it, else its bare name for the
 /// system's loader.
-pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathBuf, SessionError> {
+pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathBuf, ModelError> {
     if let Some(path) = explicit {
-        return if path.is_file() {
-            Ok(path.to_owned())
-        } else {
-            Err(SessionError::NoRuntime { path: path.to_owned() })
-        };
+        return if path.is_file() { Ok(path.to_owned()) } else { Err(no_runtime(path)) };
     }
     let name = format!("{DLL_PREFIX}onnxruntime{DLL_SUFFIX}");
     let found = beside.iter().map(|folder| folder.join(&name)).find(|path| path.is_file());
     Ok(found.unwrap_or_else(|| name.into()))
 }
 
+fn no_runtime(path: &Path) -> ModelError {
+    let fault = "no such ONNX Runtime library; `scripts/get-onnxruntime.sh` downloads one and prints its path, which \
+                 --runtime takes";
+    ModelError::at(path, fault)
+}
+
 /// The loaded library and its environment; a process has only one.
 static RUNTIME: Mutex<Option<(PathBuf, Environment)>> = Mutex::new(None);
 
 /// Loads the library on first use.
-pub(crate) fn environment(runtime: &Path) -> Result<Environment, SessionError> {
+pub(crate) fn environment(runtime: &Path) -> Result<Environment, ModelError> {
     // The loader would try a relative path beside the program first.
     let path = if runtime.components().count() > 1 {
-        runtime.canonicalize().map_err(|_| SessionError::NoRuntime { path: runtime.to_owned() })?
+        runtime.canonicalize().map_err(|_| no_runtime(runtime))?
     } else {
         runtime.to_owned()
     };
@@ -450,17 +435,27 @@ pub(crate) fn environment(runtime: &Path) -> Result<Environment, SessionError> {
     match &*loaded {
         Some((loaded, environment)) if *loaded == path => return Ok(environment.clone()),
         Some((loaded, _)) => {
-            return Err(SessionError::OtherRuntime { loaded: loaded.clone(), asked: path });
+            let (loaded, asked) = (loaded.display(), path.display());
+            return Err(ModelError(format!(
+                "ONNX Runtime is already loaded from {loaded}, but {asked} is requested; use one per process"
+            )));
         }
         None => {}
     }
+    let unfit = |cause: ort::LoadDynamicError| {
+        ModelError(format!(
+            "ONNX Runtime: {cause}; version 1.17 or newer is needed: `scripts/get-onnxruntime.sh` downloads it and \
+             prints its path, which --runtime takes; beside the program it is found by itself"
+        ))
+    };
+    let advice = "check its version (1.17 or newer)";
     let environment = ort::init_from(&path)
-        .map_err(|cause| SessionError::Runtime { cause: Box::new(cause) })?
+        .map_err(unfit)?
         .with_name("slag")
         .with_telemetry(false)
         .with_logger(Arc::new(forward_log))
         .build()
-        .map_err(|cause| SessionError::Start { cause })?;
+        .map_err(|cause| ModelError(format!("ONNX Runtime does not start: {cause}; {advice}")))?;
     environment.set_log_level(LogLevel::Warning);
     *loaded = Some((path, environment.clone()));
     Ok(environment)

@@ -11,9 +11,8 @@ use crate::{
     clean::clean,
     description::OnnxText,
     encoder::normalise,
-    error::TokenizerError,
     placement::Placement,
-    session::{Model, SessionError, SessionOptions},
+    session::{Model, SessionOptions},
     synonyms::KnownPhrases,
 };
 
@@ -31,22 +30,23 @@ impl Tokens {
         file: &ModelFile,
         max_tokens: usize,
         end_token_id: impl Into<Option<u32>>,
-    ) -> Result<Self, TokenizerError> {
+    ) -> Result<Self, ModelError> {
         let end_token_id = end_token_id.into();
-        let path = &*file.path;
-        let bytes = file.read().map_err(|cause| TokenizerError::Read { cause })?;
-        let mut tokenizer = Tokenizer::from_bytes(bytes)
-            .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
+        let bytes = file.read().map_err(|cause| ModelError::unreadable(&cause))?;
+        let unfit = |fault| ModelError::at(&file.path, format_args!("{fault}; fetch tokenizer.json again"));
+        let mut tokenizer = Tokenizer::from_bytes(bytes).map_err(unfit)?;
         // Padding and truncation are done here, alike for every file.
         tokenizer.with_padding(None);
-        tokenizer
-            .with_truncation(None)
-            .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
-        let tokens = Self { path: path.to_owned(), tokenizer, max_tokens, end_token_id };
+        tokenizer.with_truncation(None).map_err(unfit)?;
+        let tokens = Self { path: file.path.clone(), tokenizer, max_tokens, end_token_id };
         let found = tokens.raw_ids("")?.last().copied();
         match end_token_id {
             Some(expected) if found != Some(expected) => {
-                Err(TokenizerError::OtherVocabulary { path: path.to_owned(), expected, found })
+                let fault = format!(
+                    "texts end in token {found:?}, but the model's end token is {expected}; use the model's own \
+                     tokenizer"
+                );
+                Err(ModelError::at(&file.path, fault))
             }
             _ => Ok(tokens),
         }
@@ -57,19 +57,17 @@ impl Tokens {
         self.tokenizer.get_vocab(false).into_values().max().unwrap_or(0)
     }
 
-    fn raw_ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
-        let encoding = self
-            .tokenizer
-            .encode_fast(text, true)
-            .map_err(|error| TokenizerError::Encode { path: self.path.clone(), reason: error.to_string() })?;
-        Ok(encoding.get_ids().to_vec())
+    fn raw_ids(&self, text: &str) -> Result<Vec<u32>, ModelError> {
+        let encoding = self.tokenizer.encode_fast(text, true);
+        let unfit = |fault| ModelError::at(&self.path, format_args!("{fault}; use other words"));
+        Ok(encoding.map_err(unfit)?.get_ids().to_vec())
     }
 
     /// Ids of `text`, without a prompt, up to and including the first end token.
     ///
     /// A text that is too long is truncated before the end token. CLIP's attention is causal and its vector is
     /// read at the first end token, so later padding would have no effect.
-    pub fn ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
+    pub fn ids(&self, text: &str) -> Result<Vec<u32>, ModelError> {
         let mut ids = self.raw_ids(text)?;
         ids.truncate(self.max_tokens);
         let Some(end_token_id) = self.end_token_id else { return Ok(ids) };
@@ -125,7 +123,7 @@ impl OnnxTextEncoder {
         for name in &names {
             let slot = model.expect_input(*name, id, &[1, n_tokens])?;
             if description.padding.is_none() && slot.shape[1] != -1 {
-                return Err(model.fixed_tokens(&slot).into());
+                return Err(model.fixed_tokens(&slot));
             }
         }
         model.expect_no_input_but(&names)?;
@@ -140,10 +138,13 @@ impl OnnxTextEncoder {
         match encoder.run(&[largest, end]) {
             Ok(_) => Ok(encoder),
             Err(cause) if encoder.run(&[end, end]).is_ok() => {
-                let (path, cause) = (tokenizer.path.clone(), Box::new(cause));
-                Err(TokenizerError::MoreTokens { path, largest, cause }.into())
+                let fault = format!(
+                    "has token ids up to {largest}, which the model does not accept ({cause}); use the model's own \
+                     tokenizer"
+                );
+                Err(ModelError::at(&tokenizer.path, fault))
             }
-            Err(cause) => Err(cause.into()),
+            Err(cause) => Err(cause),
         }
     }
 
@@ -160,7 +161,7 @@ impl OnnxTextEncoder {
     }
 
     /// Returns the vector of token ids, `[dim]`.
-    fn run(&mut self, ids: &[u32]) -> Result<Vec<f32>, SessionError> {
+    fn run(&mut self, ids: &[u32]) -> Result<Vec<f32>, ModelError> {
         let (n_real, padding) = (ids.len(), self.description.padding);
         let n_tokens = padding.map_or(n_real, |padding| usize::from(padding.n_tokens));
         let filler = padding.map_or(0, |padding| padding.token_id);

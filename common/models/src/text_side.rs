@@ -1,43 +1,33 @@
 //! The text side of a model in a store: files named by content, and a description in JSON with these names.
 
-use std::path::PathBuf;
-
 use serde_json::Value;
 use slag_common::Hash32;
 
-use crate::EncoderId;
-use crate::description::{Description, DescriptionError, FileRef, Sha256};
+use crate::description::{Description, FileRef, Sha256};
 use crate::file_ref::ModelFile;
+use crate::{EncoderId, ModelError};
 
 /// Licences that permit redistribution of weights, by SPDX name.
-const REDISTRIBUTABLE: [&str; 10] = [
-    "Apache-2.0",
-    "BSD-2-Clause",
-    "BSD-3-Clause",
-    "BSL-1.0",
-    "CC-BY-4.0",
-    "CC0-1.0",
-    "ISC",
-    "MIT",
-    "Unlicense",
-    "Zlib",
-];
+const REDISTRIBUTABLE: &str =
+    "Apache-2.0, BSD-2-Clause, BSD-3-Clause, BSL-1.0, CC-BY-4.0, CC0-1.0, ISC, MIT, Unlicense, Zlib";
 
+/// Why a store cannot carry a model's text side.
 #[derive(Debug, thiserror::Error)]
-pub enum TextSideError {
-    #[error("{model} is part of every robot's program, so a store need not carry it; leave --text-model out")]
-    BuiltIn { model: String },
-    #[error(
-        "the licence of {model} is {licence:?}, which is not known to permit passing its weights on ({}); pull the model on each robot with `slag-edge models pull`, or correct `licence` in model.toml",
-        REDISTRIBUTABLE.join(", ")
-    )]
-    Licence { model: String, licence: String },
-    #[error("{}: its weights lie in a file of their own, which a store cannot carry; save the model as one file", path.display())]
-    SeparateWeights { path: PathBuf },
-    #[error(transparent)]
-    Description(#[from] DescriptionError),
-    #[error("{model}: its description does not survive as JSON ({what}); report this with the model.toml")]
-    Other { model: String, what: String },
+#[error("{0}")]
+pub struct TextSideError(pub(crate) String);
+
+impl TextSideError {
+    fn unlike(model: &str, what: impl std::fmt::Display) -> Self {
+        Self(format!(
+            "{model}: its description does not survive as JSON ({what}); report this with the model.toml"
+        ))
+    }
+}
+
+impl From<ModelError> for TextSideError {
+    fn from(error: ModelError) -> Self {
+        Self(error.0)
+    }
 }
 
 /// The text side of a model: its files, and the description before these are renamed.
@@ -68,7 +58,10 @@ fn pointer(role: &str) -> &'static str {
 
 /// Whether a licence expression is known to permit redistribution: every part joined by AND, or any joined by OR.
 fn may_be_passed_on(licence: &str) -> bool {
-    let is_known = |name: &str| REDISTRIBUTABLE.contains(&name.trim_matches(['(', ')', ' ']));
+    let is_known = |name: &str| {
+        let name = name.trim_matches(['(', ')', ' ']);
+        REDISTRIBUTABLE.split(", ").any(|known| known == name)
+    };
     licence.split(" OR ").any(|part| part.split(" AND ").all(is_known))
 }
 
@@ -79,13 +72,17 @@ impl TextSide {
         id: &EncoderId,
         document: &str,
         hashed: &Description,
-        open: impl Fn(&FileRef) -> Result<ModelFile, DescriptionError>,
+        open: impl Fn(&FileRef) -> Result<ModelFile, ModelError>,
     ) -> Result<Self, TextSideError> {
-        let model = || hashed.name.clone();
-        if !may_be_passed_on(&hashed.licence) {
-            return Err(TextSideError::Licence { model: model(), licence: hashed.licence.clone() });
+        let (model, licence) = (&hashed.name, &hashed.licence);
+        if !may_be_passed_on(licence) {
+            return Err(TextSideError(format!(
+                "the licence of {model} is {licence:?}, which is not known to permit passing its weights on \
+                 ({REDISTRIBUTABLE}); pull the model on each robot with `slag-edge models pull`, or correct `licence` in \
+                 model.toml"
+            )));
         }
-        let other = |what: String| TextSideError::Other { model: model(), what };
+        let other = |what: String| TextSideError::unlike(model, what);
         let table: toml::Table = toml::from_str(document).map_err(|e| other(e.to_string()))?;
         let mut description = serde_json::to_value(table).map_err(|e| other(e.to_string()))?;
         if let Some(fields) = description.as_object_mut() {
@@ -107,7 +104,9 @@ impl TextSide {
                 continue;
             }
             if file.data.is_some() {
-                return Err(TextSideError::SeparateWeights { path: file.path.clone() });
+                let fault = "its weights lie in a file of their own, which a store cannot carry; save the model as \
+                             one file";
+                return Err(ModelError::at(&file.path, fault).into());
             }
             match files.iter_mut().find(|known| known.sha256 == sha256) {
                 Some(known) => known.pointers.push(at),
@@ -125,7 +124,7 @@ impl TextSide {
     /// The description in JSON. `names`: BLAKE3 of each of [`Self::files`].
     pub fn description(&self, names: &[Hash32]) -> Result<Vec<u8>, TextSideError> {
         let mut description = self.description.clone();
-        let other = |what: String| TextSideError::Other { model: self.id.name.clone(), what };
+        let other = |what: String| TextSideError::unlike(&self.id.name, what);
         for (TextFile { pointers, .. }, name) in self.files.iter().zip(names) {
             for at in pointers {
                 let named = description.pointer_mut(at).ok_or_else(|| other(format!("{at} is missing")))?;

@@ -13,8 +13,9 @@ fn written(sections: &[(u32, &[u8])]) -> AlignedBytes {
     AlignedBytes::copy_of(&bytes)
 }
 
-fn checked(bytes: &AlignedBytes) -> Result<Option<LandmarksLayout>, ContainerError> {
-    LandmarksLayout::check(bytes, &Layout::check(bytes, MAGIC, 1)?)
+fn checked(bytes: &AlignedBytes) -> Result<Option<Landmarks<'_>>, ContainerError> {
+    let layout = Layout::check(bytes, MAGIC, 1)?;
+    check(bytes, &layout).map(|()| Landmarks::of(bytes, &layout))
 }
 
 /// By hand: the ends of an axis are exact, a third of it is the nearest of 65,535 steps; an axis without extent has
@@ -35,8 +36,7 @@ fn landmarks_come_back_by_hand() {
     // Little-endian: 16 bytes of the first record's code.
     assert_eq!(sections[1].1[8..24], code.to_le_bytes());
     let bytes = written(&sections);
-    let layout = checked(&bytes).expect("sound").expect("there");
-    let view = layout.view(&bytes);
+    let view = checked(&bytes).expect("sound").expect("there");
     assert_eq!((view.header.code_version, built.len_bytes()), (7, 56 + 3 * 24));
     let found: Vec<_> = view.iter().collect();
     assert_eq!(

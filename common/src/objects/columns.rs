@@ -5,7 +5,7 @@ use std::ops::Range;
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
-use super::thumbnails::{Thumbnails, ThumbnailsLayout};
+use super::thumbnails::{self, Thumbnails};
 use crate::container::{self, ContainerError, Layout, damaged};
 use crate::frames::Aabb;
 use crate::quantise::quantise;
@@ -99,6 +99,20 @@ pub struct Objects<'a> {
 }
 
 impl<'a> Objects<'a> {
+    /// Returns the objects in a shard's checked bytes.
+    pub(crate) fn of(bytes: &'a [u8], layout: &Layout) -> Option<Self> {
+        layout.find(section::HEADER).map(|header| Self {
+            header: bytemuck::pod_read_unaligned(&bytes[header]),
+            records: layout.slice(bytes, section::RECORDS),
+            vectors: layout.slice(bytes, section::VECTORS),
+            steps: layout.slice(bytes, section::STEPS),
+            run_ends: layout.slice(bytes, section::RUN_ENDS),
+            run_objects: layout.slice(bytes, section::RUN_OBJECTS),
+            photos: layout.slice(bytes, section::PHOTOS),
+            thumbnails: Thumbnails::of(bytes, layout),
+        })
+    }
+
     /// Returns the sections, to be written after the shard's own.
     pub fn sections(&self) -> impl Iterator<Item = (u32, &[u8])> {
         let columns = [
@@ -150,82 +164,51 @@ const MAX_STEP: f32 = 4096.0;
 /// Largest error of a score: the longest difference of two vectors of about unit length.
 const MAX_ERROR: f32 = 4.0;
 
-#[derive(Clone, Debug)]
-pub(crate) struct ObjectsLayout {
-    header: ObjectsHeader,
-    columns: [Range<usize>; 6],
-    thumbnails: Option<ThumbnailsLayout>,
-}
-
-impl ObjectsLayout {
-    /// Checks the objects of a shard of `n_gaussians` Gaussians and `m` components; returns `None` if it has none.
-    pub(crate) fn check(
-        bytes: &[u8],
-        layout: &Layout,
-        n_gaussians: u32,
-        m: usize,
-    ) -> Result<Option<Self>, ContainerError> {
-        let Some(at_header) = layout.find(section::HEADER) else { return Ok(None) };
-        let header: ObjectsHeader = layout.value(bytes, section::HEADER, "header of the objects")?;
-        if let Some(what) = header_fault(&header) {
-            return Err(damaged(at_header.start, what));
-        }
-        let (n, n_vectors, n_runs) =
-            (header.n_objects as usize, header.n_vectors as usize, header.n_runs as usize);
-        let columns = [
-            layout.column::<ObjectRecord>(section::RECORDS, "objects", n)?,
-            layout.column::<i8>(section::VECTORS, "vectors of the objects", n * n_vectors * m)?,
-            layout.column::<f32>(section::STEPS, "steps of the objects", n * n_vectors)?,
-            layout.column::<u32>(section::RUN_ENDS, "ends of the runs", n_runs)?,
-            layout.column::<u16>(section::RUN_OBJECTS, "objects of the runs", n_runs)?,
-            layout.column::<u8>(section::PHOTOS, "names of the photos", header.photos_bytes as usize)?,
-        ];
-        let photos = std::str::from_utf8(&bytes[columns[5].clone()]);
-        let Some(photos) = photos.ok().filter(|names| !names.chars().any(char::is_control)) else {
-            let what = "the names of the photos are not UTF-8 without control characters";
-            return Err(damaged(columns[5].start, what));
-        };
-        let steps: Vec<f32> = bytemuck::pod_collect_to_vec(&bytes[columns[2].clone()]);
-        if !steps.iter().all(|step| (0.0..=MAX_STEP).contains(step)) {
-            let what = format!("the steps of the objects are not all within 0..={MAX_STEP}");
-            return Err(damaged(columns[2].start, what));
-        }
-        let ends: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[columns[3].clone()]);
-        let ascends = ends.first().is_none_or(|end| *end > 0) && ends.windows(2).all(|w| w[0] < w[1]);
-        if !ascends || ends.last().copied().unwrap_or(0) != n_gaussians {
-            let what = format!("the ends of the runs do not ascend to {n_gaussians}");
-            return Err(damaged(columns[3].start, what));
-        }
-        let of_runs: Vec<u16> = bytemuck::pod_collect_to_vec(&bytes[columns[4].clone()]);
-        let counted = n_by_object(&ends, &of_runs, n);
-        let n_here = counted.map_err(|object| {
-            damaged(columns[4].start, format!("a run belongs to object {object} of {n}"))
-        })?;
-        let records: Vec<ObjectRecord> = bytemuck::pod_collect_to_vec(&bytes[columns[0].clone()]);
-        for (at, (record, n_here)) in records.iter().zip(&n_here).enumerate() {
-            if let Some(what) = fault(record, *n_here, photos) {
-                let offset = columns[0].start + at * size_of::<ObjectRecord>();
-                return Err(damaged(offset, format!("object {at}: {what}")));
-            }
-        }
-        let thumbnails = ThumbnailsLayout::check(bytes, layout, n)?;
-        Ok(Some(Self { header, columns, thumbnails }))
+/// Checks the objects of a shard of `n_gaussians` Gaussians and `m` components; without any there is nothing to check.
+pub(crate) fn check(bytes: &[u8], layout: &Layout, n_gaussians: u32, m: usize) -> Result<(), ContainerError> {
+    let Some(at_header) = layout.find(section::HEADER) else { return Ok(()) };
+    let header: ObjectsHeader = layout.value(bytes, section::HEADER, "header of the objects")?;
+    if let Some(what) = header_fault(&header) {
+        return Err(damaged(at_header.start, what));
     }
-
-    pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Objects<'a> {
-        let [records, vectors, steps, run_ends, run_objects, photos] =
-            self.columns.each_ref().map(|range| &bytes[range.clone()]);
-        Objects {
-            header: self.header,
-            records: bytemuck::cast_slice(records),
-            vectors: bytemuck::cast_slice(vectors),
-            steps: bytemuck::cast_slice(steps),
-            run_ends: bytemuck::cast_slice(run_ends),
-            run_objects: bytemuck::cast_slice(run_objects),
-            photos,
-            thumbnails: self.thumbnails.as_ref().map(|thumbnails| thumbnails.view(bytes)),
+    let (n, n_vectors, n_runs) =
+        (header.n_objects as usize, header.n_vectors as usize, header.n_runs as usize);
+    let columns = [
+        layout.column::<ObjectRecord>(section::RECORDS, "objects", n)?,
+        layout.column::<i8>(section::VECTORS, "vectors of the objects", n * n_vectors * m)?,
+        layout.column::<f32>(section::STEPS, "steps of the objects", n * n_vectors)?,
+        layout.column::<u32>(section::RUN_ENDS, "ends of the runs", n_runs)?,
+        layout.column::<u16>(section::RUN_OBJECTS, "objects of the runs", n_runs)?,
+        layout.column::<u8>(section::PHOTOS, "names of the photos", header.photos_bytes as usize)?,
+    ];
+    let photos = std::str::from_utf8(&bytes[columns[5].clone()]);
+    let Some(photos) = photos.ok().filter(|names| !names.chars().any(char::is_control)) else {
+        let what = "the names of the photos are not UTF-8 without control characters";
+        return Err(damaged(columns[5].start, what));
+    };
+    let steps: Vec<f32> = bytemuck::pod_collect_to_vec(&bytes[columns[2].clone()]);
+    if !steps.iter().all(|step| (0.0..=MAX_STEP).contains(step)) {
+        let what = format!("the steps of the objects are not all within 0..={MAX_STEP}");
+        return Err(damaged(columns[2].start, what));
+    }
+    let ends: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[columns[3].clone()]);
+    let ascends = ends.first().is_none_or(|end| *end > 0) && ends.windows(2).all(|w| w[0] < w[1]);
+    if !ascends || ends.last().copied().unwrap_or(0) != n_gaussians {
+        let what = format!("the ends of the runs do not ascend to {n_gaussians}");
+        return Err(damaged(columns[3].start, what));
+    }
+    let of_runs: Vec<u16> = bytemuck::pod_collect_to_vec(&bytes[columns[4].clone()]);
+    let counted = n_by_object(&ends, &of_runs, n);
+    let n_here = counted
+        .map_err(|object| damaged(columns[4].start, format!("a run belongs to object {object} of {n}")))?;
+    let records: Vec<ObjectRecord> = bytemuck::pod_collect_to_vec(&bytes[columns[0].clone()]);
+    for (at, (record, n_here)) in records.iter().zip(&n_here).enumerate() {
+        if let Some(what) = fault(record, *n_here, photos) {
+            let offset = columns[0].start + at * size_of::<ObjectRecord>();
+            return Err(damaged(offset, format!("object {at}: {what}")));
         }
     }
+    thumbnails::check(bytes, layout, n)
 }
 
 fn header_fault(header: &ObjectsHeader) -> Option<String> {

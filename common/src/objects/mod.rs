@@ -9,7 +9,7 @@ mod columns;
 mod thumbnails;
 
 pub use changes::{Changes, Moved, Place, Thing, changes, is_unchanged, parse_public_id, public_id};
-pub(crate) use columns::ObjectsLayout;
+pub(crate) use columns::check;
 pub use columns::{
     MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs,
     object_score, quantise_vectors, section,

@@ -1,7 +1,5 @@
 //! Small pictures of a shard's objects, each cut from the photo that shows the object best.
 
-use std::ops::Range;
-
 use crate::container::{ContainerError, Layout, damaged};
 
 pub mod section {
@@ -24,6 +22,11 @@ pub struct Thumbnails<'a> {
 }
 
 impl<'a> Thumbnails<'a> {
+    pub(super) fn of(bytes: &'a [u8], layout: &Layout) -> Option<Self> {
+        let pictures = layout.find(section::PICTURES)?;
+        Some(Self { ends: layout.slice(bytes, section::ENDS), pictures: &bytes[pictures] })
+    }
+
     pub fn get(&self, object: usize) -> Option<&'a [u8]> {
         let start = object.checked_sub(1).map_or(0, |before| self.ends[before]);
         let picture = &self.pictures[start as usize..self.ends[object] as usize];
@@ -35,41 +38,23 @@ impl<'a> Thumbnails<'a> {
     }
 }
 
-#[derive(Clone, Debug)]
-pub(super) struct ThumbnailsLayout {
-    ends: Range<usize>,
-    pictures: Range<usize>,
-}
-
-impl ThumbnailsLayout {
-    /// Checks the pictures of a shard of `n` objects; returns `None` if it has none.
-    pub(super) fn check(bytes: &[u8], layout: &Layout, n: usize) -> Result<Option<Self>, ContainerError> {
-        let Some(pictures) = layout.find(section::PICTURES) else { return Ok(None) };
-        let columns =
-            Self { ends: layout.column::<u32>(section::ENDS, "ends of the thumbnails", n)?, pictures };
-        let ends: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[columns.ends.clone()]);
-        let len = columns.pictures.len();
-        if !ends.is_sorted() || ends.last().map_or(0, |end| *end as usize) != len {
-            let what = format!("the ends of the thumbnails do not ascend to {len}");
-            return Err(damaged(columns.ends.start, what));
-        }
-        let view = Thumbnails { ends: &ends, pictures: &bytes[columns.pictures.clone()] };
-        let is_sound = |picture: &[u8]| picture.len() <= MAX_THUMBNAIL_BYTES && picture.starts_with(&JPEG);
-        match (0..n).find(|object| view.get(*object).is_some_and(|picture| !is_sound(picture))) {
-            Some(object) => {
-                let what = format!(
-                    "the thumbnail of object {object} is no JPEG file of at most {MAX_THUMBNAIL_BYTES} bytes"
-                );
-                Err(damaged(columns.pictures.start, what))
-            }
-            None => Ok(Some(columns)),
-        }
+/// Checks the pictures of a shard of `n` objects, if it has any.
+pub(super) fn check(bytes: &[u8], layout: &Layout, n: usize) -> Result<(), ContainerError> {
+    let Some(pictures) = layout.find(section::PICTURES) else { return Ok(()) };
+    let at_ends = layout.column::<u32>(section::ENDS, "ends of the thumbnails", n)?;
+    let ends: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[at_ends.clone()]);
+    let len = pictures.len();
+    if !ends.is_sorted() || ends.last().map_or(0, |end| *end as usize) != len {
+        let what = format!("the ends of the thumbnails do not ascend to {len}");
+        return Err(damaged(at_ends.start, what));
     }
-
-    pub(super) fn view<'a>(&self, bytes: &'a [u8]) -> Thumbnails<'a> {
-        Thumbnails {
-            ends: bytemuck::cast_slice(&bytes[self.ends.clone()]),
-            pictures: &bytes[self.pictures.clone()],
+    let view = Thumbnails { ends: &ends, pictures: &bytes[pictures.clone()] };
+    let is_sound = |picture: &[u8]| picture.len() <= MAX_THUMBNAIL_BYTES && picture.starts_with(&JPEG);
+    match (0..n).find(|object| view.get(*object).is_some_and(|picture| !is_sound(picture))) {
+        Some(object) => {
+            let expected = format!("no JPEG file of at most {MAX_THUMBNAIL_BYTES} bytes");
+            Err(damaged(pictures.start, format!("the thumbnail of object {object} is {expected}")))
         }
+        None => Ok(()),
     }
 }

@@ -38,15 +38,6 @@ pub struct OccupancyHeader {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum VoxelState {
-    /// Nothing: no view has looked there.
-    Unknown,
-    /// Views have looked through it, and nothing is there.
-    Free,
-    Occupied,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunKind {
     Free = 1,
     Occupied = 2,
@@ -108,6 +99,13 @@ pub struct Occupancy<'a> {
 }
 
 impl<'a> Occupancy<'a> {
+    /// Returns the occupancy in a shard's checked bytes.
+    pub(crate) fn of(bytes: &'a [u8], layout: &Layout) -> Option<Self> {
+        let header = bytemuck::pod_read_unaligned(&bytes[layout.find(section::HEADER)?]);
+        let (runs, masks) = (layout.slice(bytes, section::RUNS), layout.slice(bytes, section::MASKS));
+        Some(Self { header, runs, masks })
+    }
+
     /// Returns the sections, to be written after the shard's own.
     pub fn sections(&self) -> [(u32, &[u8]); 3] {
         [
@@ -128,44 +126,6 @@ impl<'a> Occupancy<'a> {
             Some(BlockRun { blocks: run.start..run.start + run.len(), kind, masks: of_run })
         })
     }
-
-    pub fn block_at(&self, index: u32) -> [i32; 3] {
-        let [_, n_y, n_z] = self.header.n_blocks;
-        let (x, y, z) = (index / n_z / n_y, index / n_z % n_y, index % n_z);
-        let first = self.header.first_block;
-        [first[0] + x as i32, first[1] + y as i32, first[2] + z as i32]
-    }
-}
-
-/// `voxel`: 0..4 each.
-pub(super) fn state_of(masks: [u64; 2], [x, y, z]: [i32; 3]) -> VoxelState {
-    let bit = 1u64 << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x));
-    match (masks[0] & bit != 0, masks[1] & bit != 0) {
-        (true, _) => VoxelState::Occupied,
-        (false, true) => VoxelState::Free,
-        (false, false) => VoxelState::Unknown,
-    }
-}
-
-impl Occupancy<'_> {
-    /// Returns the state of a voxel of the scene's lattice. Scans the runs: for tests and evaluation, not for maps.
-    pub fn state(&self, voxel: [i32; 3]) -> VoxelState {
-        let block = voxel.map(|v| v.div_euclid(BLOCK_EDGE));
-        let of_run = |run: BlockRun<'_>| {
-            let index = self.index_of(block).filter(|index| run.blocks.contains(index))?;
-            Some(state_of(run.masks_of(index), voxel.map(|v| v.rem_euclid(BLOCK_EDGE))))
-        };
-        self.runs().find_map(of_run).unwrap_or(VoxelState::Unknown)
-    }
-
-    fn index_of(&self, block: [i32; 3]) -> Option<u32> {
-        let OccupancyHeader { first_block, n_blocks, .. } = self.header;
-        let at = |axis: usize| {
-            let offset = u32::try_from(block[axis].checked_sub(first_block[axis])?).ok()?;
-            (offset < n_blocks[axis]).then_some(offset)
-        };
-        Some(at(2)? + n_blocks[2] * (at(1)? + n_blocks[1] * at(0)?))
-    }
 }
 
 /// Most blocks of a shard's box: readers count them in 32 bits, and a writer keeps within 512 along each axis.
@@ -174,59 +134,41 @@ const MAX_BLOCKS: u64 = 1 << 27;
 const MAX_BLOCK: i64 = 1 << 28;
 const MAX_VOXEL: f64 = 1e6;
 
-#[derive(Clone, Debug)]
-pub(crate) struct OccupancyLayout {
-    header: OccupancyHeader,
-    columns: [Range<usize>; 2],
-}
-
-impl OccupancyLayout {
-    /// Checks the occupancy; returns `None` if the shard has none.
-    pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<Option<Self>, ContainerError> {
-        let Some(at_header) = layout.find(section::HEADER) else { return Ok(None) };
-        let header: OccupancyHeader = layout.value(bytes, section::HEADER, "header of the occupancy")?;
-        check_header(&header).map_err(|what| damaged(at_header.start, what))?;
-        let runs = layout.column::<StoredRun>(section::RUNS, "runs of blocks", header.n_runs as usize)?;
-        let masks = layout.column::<[u64; 2]>(section::MASKS, "masks of blocks", header.n_mixed as usize)?;
-        let n_blocks: u32 = header.n_blocks.iter().product();
-        let (mut end, mut n_mixed) = (0u32, 0u64);
-        let stored: Vec<StoredRun> = bytemuck::pod_collect_to_vec(&bytes[runs.clone()]);
-        for (at, run) in stored.iter().enumerate() {
-            let stop = run.start.checked_add(run.len()).filter(|stop| *stop <= n_blocks);
-            let (true, true, Some(stop), Some(kind)) = (run.start >= end, run.len() > 0, stop, run.kind())
-            else {
-                let what = format!(
-                    "run {at} of blocks begins at {} and has {} of kind {}, expected a begin of at least {end}, an end of at most {n_blocks} and kind 1 to 3",
-                    run.start,
-                    run.len(),
-                    run.len_and_kind & 3
-                );
-                return Err(damaged(runs.start + at * size_of::<StoredRun>(), what));
-            };
-            end = stop;
-            n_mixed += if kind == RunKind::Mixed { u64::from(run.len()) } else { 0 };
-        }
-        if n_mixed != u64::from(header.n_mixed) {
-            let what = format!("{n_mixed} mixed blocks in the runs, the header has {}", header.n_mixed);
-            return Err(damaged(at_header.start, what));
-        }
-        for (at, pair) in bytes[masks.clone()].chunks_exact(16).enumerate() {
-            if (0..8).any(|byte| pair[byte] & pair[8 + byte] != 0) {
-                let what = format!("a voxel of mixed block {at} is free and occupied");
-                return Err(damaged(masks.start + at * 16, what));
-            }
-        }
-        Ok(Some(Self { header, columns: [runs, masks] }))
+/// Checks the occupancy of a shard, if it has any.
+pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<(), ContainerError> {
+    let Some(at_header) = layout.find(section::HEADER) else { return Ok(()) };
+    let header: OccupancyHeader = layout.value(bytes, section::HEADER, "header of the occupancy")?;
+    check_header(&header).map_err(|what| damaged(at_header.start, what))?;
+    let runs = layout.column::<StoredRun>(section::RUNS, "runs of blocks", header.n_runs as usize)?;
+    let masks = layout.column::<[u64; 2]>(section::MASKS, "masks of blocks", header.n_mixed as usize)?;
+    let n_blocks: u32 = header.n_blocks.iter().product();
+    let (mut end, mut n_mixed) = (0u32, 0u64);
+    let stored: Vec<StoredRun> = bytemuck::pod_collect_to_vec(&bytes[runs.clone()]);
+    for (at, run) in stored.iter().enumerate() {
+        let stop = run.start.checked_add(run.len()).filter(|stop| *stop <= n_blocks);
+        let (true, true, Some(stop), Some(kind)) = (run.start >= end, run.len() > 0, stop, run.kind()) else {
+            let what = format!(
+                "run {at} of blocks begins at {} and has {} of kind {}, expected a begin of at least {end}, an end of at most {n_blocks} and kind 1 to 3",
+                run.start,
+                run.len(),
+                run.len_and_kind & 3
+            );
+            return Err(damaged(runs.start + at * size_of::<StoredRun>(), what));
+        };
+        end = stop;
+        n_mixed += if kind == RunKind::Mixed { u64::from(run.len()) } else { 0 };
     }
-
-    pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Occupancy<'a> {
-        let [runs, masks] = self.columns.each_ref().map(|range| &bytes[range.clone()]);
-        Occupancy {
-            header: self.header,
-            runs: bytemuck::cast_slice(runs),
-            masks: bytemuck::cast_slice(masks),
+    if n_mixed != u64::from(header.n_mixed) {
+        let what = format!("{n_mixed} mixed blocks in the runs, the header has {}", header.n_mixed);
+        return Err(damaged(at_header.start, what));
+    }
+    for (at, pair) in bytes[masks.clone()].chunks_exact(16).enumerate() {
+        if (0..8).any(|byte| pair[byte] & pair[8 + byte] != 0) {
+            let what = format!("a voxel of mixed block {at} is free and occupied");
+            return Err(damaged(masks.start + at * 16, what));
         }
     }
+    Ok(())
 }
 
 fn check_header(header: &OccupancyHeader) -> Result<(), String> {

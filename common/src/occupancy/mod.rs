@@ -9,8 +9,7 @@ mod columns;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use columns::OccupancyLayout;
+pub(crate) use columns::check;
 pub use columns::{
-    BLOCK_EDGE, Block, BlockRun, BuiltOccupancy, Occupancy, OccupancyHeader, RunKind, StoredRun, VoxelState,
-    section,
+    BLOCK_EDGE, Block, BlockRun, BuiltOccupancy, Occupancy, OccupancyHeader, RunKind, StoredRun, section,
 };

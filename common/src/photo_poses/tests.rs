@@ -30,15 +30,14 @@ fn checked(built: &BuiltPhotoPoses) -> Result<AlignedBytes, ContainerError> {
     container::write(&mut bytes, MAGIC, 1, &built.view().expect("photos").sections()).expect("memory");
     let bytes = AlignedBytes::copy_of(&bytes);
     let layout = Layout::check(&bytes, MAGIC, 1)?;
-    PhotoPosesLayout::check(&bytes, &layout).map(|_| bytes)
+    check(&bytes, &layout).map(|()| bytes)
 }
 
 #[test]
 fn photos_come_back_by_hand() {
     let bytes = checked(&built()).expect("sound");
     let layout = Layout::check(&bytes, MAGIC, 1).expect("sound");
-    let photos = PhotoPosesLayout::check(&bytes, &layout).expect("sound").expect("there");
-    let photos: Vec<_> = photos.view(&bytes).iter().collect();
+    let photos: Vec<_> = PhotoPoses::of(&bytes, &layout).expect("there").iter().collect();
     assert_eq!(photos.iter().map(|(_, name)| *name).collect::<Vec<_>>(), ["a/1.jpg", "", "Büro.jpg"]);
     let (pose, _) = photos[2];
     assert_eq!((pose.offset, pose.focal_px), ([1.0 - 1e6, 0.0, 2.5], 501.0));

@@ -24,27 +24,21 @@ pub(super) fn check_intrinsics(
     [centre_x_px, centre_y_px]: [f64; 2],
     distortion: Distortion,
 ) -> Result<Intrinsics, PoseProblem> {
-    let side = |field, value: f64| {
-        if value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value) {
-            Ok(value as u32)
-        } else {
-            Err(PoseProblem::BadIntrinsics { field, value, expected: "a whole number from 1 to 65535" })
+    let check = |field: &str, value: f64, holds: bool, expected: &str| match holds {
+        true => Ok(value),
+        false => {
+            let fault = format!("{field} is {value}, expected {expected}");
+            Err(PoseProblem::new(fault, "export the poses again"))
         }
+    };
+    let side = |field, value: f64| {
+        let holds = value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value);
+        check(field, value, holds, "a whole number from 1 to 65535").map(|value| value as u32)
     };
     let focal = |field, value: f64| {
-        if value.is_finite() && value > 0.0 {
-            Ok(value)
-        } else {
-            Err(PoseProblem::BadIntrinsics { field, value, expected: "a positive number of pixels" })
-        }
+        check(field, value, value.is_finite() && value > 0.0, "a positive number of pixels")
     };
-    let finite = |field, value: f64| {
-        if value.is_finite() {
-            Ok(value)
-        } else {
-            Err(PoseProblem::BadIntrinsics { field, value, expected: "a finite number" })
-        }
-    };
+    let finite = |field, value: f64| check(field, value, value.is_finite(), "a finite number");
     let coefficients: &[f64] = match &distortion {
         Distortion::None => &[],
         Distortion::Brown { k, p } => &[k[0], k[1], k[2], p[0], p[1]],
@@ -70,50 +64,51 @@ pub(super) fn check_intrinsics(
 }
 
 /// Returns the transform of a quaternion (w, x, y, z), which is normalised first, and a translation.
-pub(super) fn affine_from_wxyz(
-    image: &str,
-    wxyz: [f64; 4],
-    translation: [f64; 3],
-) -> Result<DAffine3, PoseProblem> {
+pub(super) fn affine_from_wxyz(wxyz: [f64; 4], translation: [f64; 3]) -> Result<DAffine3, PoseProblem> {
     let [w, x, y, z] = wxyz;
     let rotation = DQuat::from_xyzw(x, y, z, w);
-    let deviation = (rotation.length() - 1.0).abs();
-    if deviation.is_nan() || deviation > ROTATION_TOLERANCE {
-        return Err(PoseProblem::NotARotation { image: image.to_owned(), deviation });
-    }
+    check_rotation((rotation.length() - 1.0).abs())?;
     let translation = check_translation(translation)?;
     Ok(DAffine3::from_rotation_translation(rotation.normalize(), translation))
 }
 
 /// Returns the transform of a rotation matrix, which is orthonormalised first, and a translation.
-fn affine_from_matrix(image: &str, rotation: DMat3, translation: [f64; 3]) -> Result<DAffine3, PoseProblem> {
+fn affine_from_matrix(rotation: DMat3, translation: [f64; 3]) -> Result<DAffine3, PoseProblem> {
     let gram = rotation.transpose() * rotation - DMat3::IDENTITY;
     let largest =
         gram.to_cols_array().iter().fold(0.0_f64, |m, v| if v.is_nan() { *v } else { m.max(v.abs()) });
-    if largest.is_nan() || largest > ROTATION_TOLERANCE {
-        return Err(PoseProblem::NotARotation { image: image.to_owned(), deviation: largest });
-    }
+    check_rotation(largest)?;
     // A reflection is orthonormal too, with determinant -1 instead of 1.
     if rotation.determinant() < 0.0 {
-        return Err(PoseProblem::Mirrored { image: image.to_owned() });
+        let fault = "its matrix mirrors (its determinant is -1): the export has left-handed axes";
+        let advice = "negate one axis of the world, or export with right-handed axes";
+        return Err(PoseProblem::new(fault, advice));
     }
     let translation = check_translation(translation)?;
     Ok(DAffine3::from_rotation_translation(DQuat::from_mat3(&rotation).normalize(), translation))
 }
 
 /// Returns the transform of a matrix's rows; the columns of `axes` express the source's axes.
-pub(super) fn affine_from_rows(image: &str, rows: &[Vec<f64>], axes: DMat3) -> Result<DAffine3, PoseProblem> {
+pub(super) fn affine_from_rows(rows: &[Vec<f64>], axes: DMat3) -> Result<DAffine3, PoseProblem> {
     let expected = "a matrix of 3 or 4 rows and 4 columns, the fourth row being 0 0 0 1";
     let row = |index: usize| rows.get(index).and_then(|row| <[f64; 4]>::try_from(row.as_slice()).ok());
     let ([Some(a), Some(b), Some(c)], true) = ([row(0), row(1), row(2)], matches!(rows.len(), 3 | 4)) else {
-        return Err(PoseProblem::Expected { expected, found: format!("{} rows", rows.len()) });
+        return Err(PoseProblem::expected(expected, format!("{} rows", rows.len())));
     };
     let is_last = |row: [f64; 4]| DVec4::from(row).abs_diff_eq(DVec4::W, LAST_ROW_TOLERANCE);
     if rows.len() == 4 && !row(3).is_some_and(is_last) {
-        return Err(PoseProblem::Expected { expected, found: format!("{:?}", rows[3]) });
+        return Err(PoseProblem::expected(expected, format!("{:?}", rows[3])));
     }
     let rotation = DMat3::from_cols_array_2d(&[0, 1, 2].map(|column| [a[column], b[column], c[column]]));
-    affine_from_matrix(image, rotation * axes, [a[3], b[3], c[3]])
+    affine_from_matrix(rotation * axes, [a[3], b[3], c[3]])
+}
+
+fn check_rotation(deviation: f64) -> Result<(), PoseProblem> {
+    if deviation <= ROTATION_TOLERANCE {
+        return Ok(());
+    }
+    let advice = "export the poses again, without scale or shear";
+    Err(PoseProblem::new(format!("its rotation is off by {deviation:.3e}"), advice))
 }
 
 fn check_translation(translation: [f64; 3]) -> Result<DVec3, PoseProblem> {
@@ -121,8 +116,7 @@ fn check_translation(translation: [f64; 3]) -> Result<DVec3, PoseProblem> {
     match translation.iter().find(|value| value.is_nan() || value.abs() > MAX_TRANSLATION) {
         None => Ok(vector),
         Some(value) => {
-            let expected = "a translation of at most 1e12 along each axis";
-            Err(PoseProblem::Expected { expected, found: format!("{value:e}") })
+            Err(PoseProblem::expected("a translation of at most 1e12 along each axis", format!("{value:e}")))
         }
     }
 }

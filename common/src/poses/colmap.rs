@@ -136,6 +136,11 @@ fn default_images_dir(model_dir: &Path) -> Result<PathBuf, PoseError> {
     Ok(candidates.swap_remove(found))
 }
 
+fn unsupported(camera_id: u32, model: &str) -> PoseProblem {
+    let fault = format!("camera {camera_id}: model {model} is not supported");
+    PoseProblem::new(fault, "run COLMAP's image_undistorter and use its output")
+}
+
 /// Returns the intrinsics of a camera; `params` has COLMAP's order.
 fn intrinsics(
     camera_id: u32,
@@ -163,9 +168,10 @@ fn intrinsics(
             let model = excerpt(model);
             return Err(match MODELS.iter().find(|(_, name, _)| *name == model) {
                 Some(&(.., expected)) if expected != params.len() => {
-                    PoseProblem::LensParameters { model, expected, found: params.len() }
+                    let fault = format!("{model} has {expected} parameters, found {}", params.len());
+                    PoseProblem::new(fault, "export the cameras again")
                 }
-                _ => PoseProblem::UnsupportedModel { camera_id, model },
+                _ => unsupported(camera_id, &model),
             });
         }
     };
@@ -209,14 +215,18 @@ impl Images {
         let (name, is_foreign) = relative(record.name);
         let is_inside = |path: &Path| path.components().all(|c| matches!(c, Component::Normal(_)));
         if name.is_empty() || name.contains('\0') || !is_inside(Path::new(&name)) {
-            return Err(PoseProblem::UnsafeName { image: name }.at(model.path, place));
+            return Err(PoseProblem::unsafe_name(&name).at(model.path, place));
         }
         let intrinsics = match model.cameras.of_id.get(&camera_id) {
             Some((_, Ok(intrinsics))) => *intrinsics,
             Some((place, Err(problem))) => return Err(problem.clone().at(&model.cameras.path, *place)),
-            None => return Err(PoseProblem::UnknownCamera { image: name, camera_id }.at(model.path, place)),
+            None => {
+                let fault =
+                    format!("image {name:?} uses camera {camera_id}, which is not in the cameras file");
+                return Err(PoseProblem::new(fault, "export both files together").at(model.path, place));
+            }
         };
-        match affine_from_wxyz(&name, wxyz, translation) {
+        match affine_from_wxyz(wxyz, translation) {
             Err(problem) => self.damaged.add(&name, problem, model.path, place),
             Ok(camera_from_world) => {
                 if is_foreign {
@@ -254,7 +264,10 @@ impl Cameras {
     ) -> Result<(), PoseError> {
         match self.of_id.insert(camera_id, (place, camera)) {
             None => Ok(()),
-            Some(_) => Err(PoseProblem::DuplicateCamera { camera_id }.at(&self.path, place)),
+            Some(_) => {
+                let fault = format!("two cameras have the id {camera_id}");
+                Err(PoseProblem::new(fault, "remove one of them").at(&self.path, place))
+            }
         }
     }
 }
@@ -286,7 +299,7 @@ impl Lines {
             1 => files::text_of(&bytes).map(str::to_owned),
             _ => String::from_utf8(bytes).map_err(|_| NotUtf8::Other),
         };
-        self.line = text.map_err(|fault| self.fail(PoseProblem::NotUtf8(fault)))?;
+        self.line = text.map_err(|fault| self.fail(fault.into()))?;
         Ok(n > 0)
     }
 
@@ -306,7 +319,7 @@ fn take<T: std::str::FromStr>(rest: &mut &str, expected: &'static str) -> Result
     let trimmed = rest.trim_start();
     let (word, after) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
     *rest = after;
-    word.parse().map_err(|_| PoseProblem::Expected { expected, found: excerpt(word) })
+    word.parse().map_err(|_| PoseProblem::expected(expected, excerpt(word)))
 }
 
 fn excerpt(text: &str) -> String {
@@ -398,7 +411,7 @@ impl Binary {
     fn take<const N: usize>(&mut self, expected: &'static str) -> Result<[u8; N], PoseError> {
         let mut bytes = [0; N];
         if self.len_bytes.saturating_sub(self.offset_bytes) < N as u64 {
-            return Err(self.fail(PoseProblem::Truncated { expected }));
+            return Err(self.fail(PoseProblem::truncated(expected)));
         }
         self.reader.read_exact(&mut bytes)?;
         self.offset_bytes += N as u64;
@@ -427,14 +440,12 @@ impl Binary {
         self.reader.by_ref().take(MAX_NAME_BYTES).read_until(0, &mut bytes)?;
         let expected = "an image name of at most 4096 bytes, terminated by a zero byte";
         if bytes.last() != Some(&0) {
-            return Err(self.fail(PoseProblem::Truncated { expected }));
+            return Err(self.fail(PoseProblem::truncated(expected)));
         }
         bytes.pop();
         let name = String::from_utf8(bytes).map_err(|e| {
-            self.fail(PoseProblem::Expected {
-                expected,
-                found: excerpt(&String::from_utf8_lossy(e.as_bytes())),
-            })
+            let found = excerpt(&String::from_utf8_lossy(e.as_bytes()));
+            self.fail(PoseProblem::expected(expected, found))
         })?;
         self.offset_bytes += name.len() as u64 + 1;
         Ok(name)
@@ -450,7 +461,7 @@ impl Binary {
                 self.offset_bytes += bytes;
                 Ok(())
             }
-            _ => Err(self.fail(PoseProblem::Truncated { expected })),
+            _ => Err(self.fail(PoseProblem::truncated(expected))),
         }
     }
 
@@ -459,7 +470,7 @@ impl Binary {
             return Ok(());
         }
         let found = format!("{} more bytes", self.len_bytes.saturating_sub(self.offset_bytes));
-        Err(self.fail(PoseProblem::Expected { expected: "the end of the file", found }))
+        Err(self.fail(PoseProblem::expected("the end of the file", found)))
     }
 }
 
@@ -470,9 +481,7 @@ fn cameras_from_binary(path: &Path) -> Result<Cameras, PoseError> {
         let camera_id = file.u32("a camera id")?;
         let model_id = i32::from_le_bytes(file.take("a lens model's number")?);
         let Some((_, model, n_params)) = MODELS.iter().find(|(id, ..)| *id == model_id) else {
-            return Err(
-                file.fail(PoseProblem::UnsupportedModel { camera_id, model: format!("number {model_id}") })
-            );
+            return Err(file.fail(unsupported(camera_id, &format!("number {model_id}"))));
         };
         let size_px = [file.u64("the width")? as f64, file.u64("the height")? as f64];
         let mut params = Vec::new();

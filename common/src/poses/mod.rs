@@ -14,7 +14,7 @@ mod view_set;
 
 use std::path::Path;
 
-pub use error::{Place, PoseError, PoseProblem};
+pub use error::PoseError;
 pub use splat_frame::{FRAME_FILE, Origin, SplatFrame, SplatFromPoses};
 pub use view_set::{AppliedTransform, PoseSource, ViewSet};
 
@@ -30,12 +30,17 @@ use crate::files;
 /// `images_dir`: by default `images/` beside COLMAP's `sparse/` (or beside or in the model's folder), the paths in a
 /// `transforms.json`, or ScanNet's `color/`. Images need not exist, except ScanNet's: only they tell their size.
 pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
+    let not_found = || {
+        let fault = "no poses found: it has no cameras and images (.bin or .txt), directly or in sparse/0 or sparse, no \
+                     transforms.json and no pose/; give the folder of a COLMAP model, a transforms.json or a ScanNet scene";
+        Err(PoseError::of(path, fault))
+    };
     if files::metadata(path)?.is_file() {
         return match path.extension().and_then(|e| e.to_str()) {
             Some("json") => transforms::read(path, images_dir),
             Some("bin") => colmap::read(paths::parent(path)?.as_path(), PoseSource::ColmapBinary, images_dir),
             Some("txt") => colmap::read(paths::parent(path)?.as_path(), PoseSource::ColmapText, images_dir),
-            _ => Err(PoseError::NotFound { path: path.to_owned() }),
+            _ => not_found(),
         };
     }
     let json = path.join("transforms.json");
@@ -63,6 +68,6 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
     } else if path.join(scannet::POSES).is_dir() {
         scannet::read(path, images_dir)
     } else {
-        Err(PoseError::NotFound { path: path.to_owned() })
+        not_found()
     }
 }

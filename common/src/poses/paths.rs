@@ -76,15 +76,9 @@ impl PhotoFinder {
                 Stated { image_path, said: name.clone(), name }
             }));
         }
-        let mut notes: Vec<String> = take_back_shared(views, &mut elsewhere).into_iter().collect();
-        let moved = views.iter().zip(&elsewhere).filter_map(|(view, stated)| Some((view, stated.as_ref()?)));
-        let moved: Vec<String> = moved
-            .map(|(view, stated)| format!("{} for {}", view.image_path.display(), stated.said))
-            .collect();
-        notes.extend(moved.first().map(|first| {
-            format!("{} photos have other names than the poses say, such as {first}", moved.len())
-        }));
-        notes
+        settle(views, elsewhere, |n, first| {
+            format!("{n} photos have other names than the poses say, such as {first}")
+        })
     }
 }
 
@@ -104,26 +98,33 @@ pub(super) struct Stated {
     pub(super) said: String,
 }
 
-/// Restores the stated paths of views that found the same photo as another view, and clears their entries in
-/// `elsewhere` (one per view). Returns a sentence on them, if there are any.
-pub(super) fn take_back_shared(views: &mut [View], elsewhere: &mut [Option<Stated>]) -> Option<String> {
+/// Restores the stated paths of views that found the same photo as another view; `elsewhere`: one per view. Returns sentences on them, and on the photos `moved`: their number, and the first.
+pub(super) fn settle(
+    views: &mut [View],
+    elsewhere: Vec<Option<Stated>>,
+    moved: impl Fn(usize, &str) -> String,
+) -> Vec<String> {
     let mut n_views_of: HashMap<PathBuf, usize> = HashMap::new();
     views.iter().for_each(|view| *n_views_of.entry(view.image_path.clone()).or_default() += 1);
-    let mut shared = Vec::new();
+    let (mut shared, mut single) = (Vec::new(), Vec::new());
     for (view, stated) in views.iter_mut().zip(elsewhere) {
-        if n_views_of.get(&view.image_path).is_some_and(|n| *n > 1)
-            && let Some(Stated { image_path, name, said }) = stated.take()
-        {
-            shared.push(format!("{} for {said}", view.image_path.display()));
+        let Some(Stated { image_path, name, said }) = stated else { continue };
+        let found = format!("{} for {said}", view.image_path.display());
+        if n_views_of[&view.image_path] > 1 {
+            shared.push(found);
             (view.image_path, view.name) = (image_path, name);
+        } else {
+            single.push(found);
         }
     }
-    let first = shared.first()?;
-    let advice = "put the photos into the folders that the poses name";
-    Some(format!(
-        "{} photos are ambiguous and left out, such as {first}, which another view names, too; {advice}",
-        shared.len()
-    ))
+    let shared = shared.first().map(|first| {
+        let n = shared.len();
+        let advice = "put the photos into the folders that the poses name";
+        format!(
+            "{n} photos are ambiguous and left out, such as {first}, which another view names, too; {advice}"
+        )
+    });
+    shared.into_iter().chain(single.first().map(|first| moved(single.len(), first))).collect()
 }
 
 /// Decodes `%20` and other percent escapes; `None` without any.

@@ -8,7 +8,7 @@
 //!
 //! `extrinsic_color.txt` and depth images are not read; nerfstudio's ScanNet dataparser does not read them either.
 
-use std::io::Read;
+use std::io::{self, Read};
 use std::path::Path;
 
 use fs_err::File;
@@ -33,16 +33,18 @@ enum Matrix {
     Known(Vec<Vec<f64>>),
     /// A value is `-inf`: tracking was lost.
     Lost,
+    Damaged(PoseProblem, Place),
 }
 
 pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
     let photos = images_dir.map_or_else(|| dir.join(PHOTOS), Path::to_owned);
     let intrinsics_path = dir.join(INTRINSICS);
-    let Matrix::Known(camera) = read_matrix(&intrinsics_path)? else {
-        let found = "-inf".to_owned();
-        return Err(
-            PoseProblem::Expected { expected: "a camera matrix", found }.at(&intrinsics_path, Place::File)
-        );
+    let camera = match read_matrix(&intrinsics_path)? {
+        Matrix::Known(camera) => camera,
+        Matrix::Lost => {
+            return Err(PoseProblem::expected("a camera matrix", "-inf").at(&intrinsics_path, Place::File));
+        }
+        Matrix::Damaged(problem, place) => return Err(problem.at(&intrinsics_path, place)),
     };
     let mut stems = Vec::new();
     for entry in fs_err::read_dir(dir.join(POSES))? {
@@ -51,8 +53,8 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
             match path.file_stem().and_then(|stem| stem.to_str()) {
                 Some(stem) => stems.push(stem.to_owned()),
                 None => {
-                    let image = path.display().to_string();
-                    return Err(PoseProblem::UnsafeName { image }.at(&path, Place::File));
+                    let name = path.display().to_string();
+                    return Err(PoseProblem::unsafe_name(&name).at(&path, Place::File));
                 }
             }
         }
@@ -63,22 +65,14 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
         let path = dir.join(POSES).join(format!("{stem}.txt"));
         let (image_path, extension) = existing(&photos.join(&stem));
         let name = format!("{stem}{extension}");
-        // Any fault of a frame's own file counts as a fault of its pose.
-        let rows = match read_matrix(&path) {
-            Ok(Matrix::Known(rows)) => rows,
-            Ok(Matrix::Lost) => {
-                without_pose.push(name);
-                continue;
-            }
-            Err(PoseError::Invalid { path, place, problem }) => {
-                damaged.add(&name, problem, &path, place);
-                continue;
-            }
-            Err(other) => return Err(other),
-        };
-        match affine_from_rows(&name, &rows, DMat3::IDENTITY) {
-            Ok(world_from_camera) => posed.push((name, image_path, world_from_camera.inverse())),
-            Err(problem) => damaged.add(&name, problem, &path, Place::File),
+        match read_matrix(&path)? {
+            Matrix::Known(rows) => match affine_from_rows(&rows, DMat3::IDENTITY) {
+                Ok(world_from_camera) => posed.push((name, image_path, world_from_camera.inverse())),
+                Err(problem) => damaged.add(&name, problem, &path, Place::File),
+            },
+            Matrix::Lost => without_pose.push(name),
+            // Any fault of a frame's own file counts as a fault of its pose.
+            Matrix::Damaged(problem, place) => damaged.add(&name, problem, &path, place),
         }
     }
     if posed.is_empty() {
@@ -86,7 +80,11 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
     }
     // All photos have the size of the first readable one.
     let Some(size_px) = posed.iter().find_map(|(_, path, _)| photo::size_px(path)) else {
-        let problem = PoseProblem::NoImageSize { n_poses: posed.len(), folder: photos };
+        let (n, folder) = (posed.len(), photos.display());
+        let fault = format!(
+            "no image of the {n} posed frames can be read in {folder}, and their size is stated nowhere else"
+        );
+        let problem = PoseProblem::new(fault, "give their folder with --images");
         return Err(problem.at(&intrinsics_path, Place::File));
     };
     let intrinsics =
@@ -103,24 +101,29 @@ fn intrinsics(camera: &[Vec<f64>], (width_px, height_px): (u32, u32)) -> Result<
     let found = check_intrinsics(size.map(f64::from), focal_px, centre_px, Distortion::None)?;
     let is_off = |axis: usize| (centre_px[axis] / f64::from(size[axis]) - 0.5).abs() > MAX_OFF_CENTRE;
     if is_off(0) || is_off(1) {
-        return Err(PoseProblem::OtherImageSize { centre_px, size_px: size });
+        let [x, y] = centre_px;
+        let fault = format!(
+            "the principal point ({x}, {y}) px is far from the middle of images of {width_px} x {height_px} px; the \
+             intrinsics belong to another image size"
+        );
+        return Err(PoseProblem::new(fault, "export the images in the size of the intrinsics"));
     }
     Ok(found)
 }
 
-fn read_matrix(path: &Path) -> Result<Matrix, PoseError> {
+fn read_matrix(path: &Path) -> io::Result<Matrix> {
     let file = File::open(path)?;
     let mut bytes = Vec::new();
     file.take(MAX_MATRIX_BYTES + 1).read_to_end(&mut bytes)?;
-    let fail = |problem: PoseProblem, place| Err(problem.at(path, place));
+    let damaged = |problem| Ok(Matrix::Damaged(problem, Place::File));
     if bytes.len() as u64 > MAX_MATRIX_BYTES {
         let bytes = files::metadata(path)?.len();
         let expected = "the text of one 4 x 4 matrix";
-        return fail(PoseProblem::TooLarge { bytes, most: MAX_MATRIX_BYTES, expected }, Place::File);
+        return damaged(PoseProblem::too_large(bytes, MAX_MATRIX_BYTES, expected));
     }
     let text = match files::text_of(&bytes) {
         Ok(text) => text,
-        Err(fault) => return fail(PoseProblem::NotUtf8(fault), Place::File),
+        Err(fault) => return damaged(fault.into()),
     };
     let mut rows = Vec::new();
     for (index, line) in text.lines().enumerate() {
@@ -129,9 +132,9 @@ fn read_matrix(path: &Path) -> Result<Matrix, PoseError> {
             match word.parse::<f64>() {
                 Ok(value) => row.push(value),
                 Err(_) => {
-                    let found = word.chars().take(40).collect();
-                    let problem = PoseProblem::Expected { expected: "a number", found };
-                    return fail(problem, Place::Line(index as u64 + 1));
+                    let problem =
+                        PoseProblem::expected("a number", word.chars().take(40).collect::<String>());
+                    return Ok(Matrix::Damaged(problem, Place::Line(index as u64 + 1)));
                 }
             }
         }
@@ -142,8 +145,8 @@ fn read_matrix(path: &Path) -> Result<Matrix, PoseError> {
     if !matches!(rows.len(), 3 | 4) || rows.iter().any(|row| row.len() != 4) {
         let found =
             format!("{} rows of {:?} numbers", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>());
-        let found = found.chars().take(60).collect();
-        return fail(PoseProblem::Expected { expected: "4 rows of 4 numbers", found }, Place::File);
+        let found: String = found.chars().take(60).collect();
+        return damaged(PoseProblem::expected("4 rows of 4 numbers", found));
     }
     let lost = rows.iter().flatten().any(|value| *value == f64::NEG_INFINITY);
     Ok(if lost { Matrix::Lost } else { Matrix::Known(rows) })

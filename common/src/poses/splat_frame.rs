@@ -57,17 +57,19 @@ impl SplatFrame {
         let fail = |problem: PoseProblem| problem.at(path, Place::File);
         if bytes.len() as u64 > MAX_BYTES {
             let bytes = files::metadata(path)?.len();
-            return Err(fail(PoseProblem::TooLarge { bytes, most: MAX_BYTES, expected: FRAME_FILE }));
+            return Err(fail(PoseProblem::too_large(bytes, MAX_BYTES, FRAME_FILE)));
         }
-        let text = files::text_of(&bytes).map_err(|fault| fail(PoseProblem::NotUtf8(fault)))?;
-        let json: Json =
-            serde_json::from_str(text).map_err(|cause| PoseError::Frame { path: path.to_owned(), cause })?;
+        let text = files::text_of(&bytes).map_err(|fault| fail(fault.into()))?;
+        let json: Json = serde_json::from_str(text).map_err(|cause| {
+            let advice = "remove the file, or name another with --splat-frame";
+            let expected = "expected nerfstudio's transform (3 x 4) and scale";
+            PoseError::of(path, format_args!("{cause}; {expected}; {advice}"))
+        })?;
         // A larger factor is no change of unit, and squared lengths would exceed f32.
         if !(1e-9..=1e9).contains(&json.scale) {
-            let found = json.scale.to_string();
-            return Err(fail(PoseProblem::Expected { expected: "a scale from 1e-9 to 1e9", found }));
+            return Err(fail(PoseProblem::expected("a scale from 1e-9 to 1e9", json.scale)));
         }
-        let transform = affine_from_rows("transform", &json.transform, DMat3::IDENTITY).map_err(fail)?;
+        let transform = affine_from_rows(&json.transform, DMat3::IDENTITY).map_err(fail)?;
         Ok(Self { transform, scale: json.scale, from_poses: json.from.as_deref() == Some(FROM_POSES) })
     }
 

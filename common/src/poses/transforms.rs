@@ -12,7 +12,7 @@ use serde::de::IgnoredAny;
 
 use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
-use super::paths::{PhotoFinder, Stated, parent, parts_of, take_back_shared};
+use super::paths::{PhotoFinder, Stated, parent, parts_of, settle};
 use super::view_set::{AppliedTransform, Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::{files, photo};
@@ -73,14 +73,16 @@ struct Transforms {
 pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
     let bytes = files::read(path)?;
     let in_file = |problem: PoseProblem| problem.at(path, Place::File);
-    let text = files::text_of(&bytes).map_err(|fault| in_file(PoseProblem::NotUtf8(fault)))?;
+    let text = files::text_of(&bytes).map_err(|fault| in_file(fault.into()))?;
     let text = null_for_nan(text.as_bytes());
     if text.trim_ascii_start().starts_with(b"[") {
-        let what = "this is a list, as the cameras.json of a training run, not a transforms.json";
-        return Err(in_file(PoseProblem::OtherKind { what }));
+        let fault = "this is a list, as the cameras.json of a training run, not a transforms.json";
+        let advice = "give the COLMAP model that the splat was trained from, or a transforms.json";
+        return Err(in_file(PoseProblem::new(fault, advice)));
     }
-    let transforms: Transforms =
-        serde_json::from_slice(&text).map_err(|cause| PoseError::Json { path: path.to_owned(), cause })?;
+    let transforms: Transforms = serde_json::from_slice(&text).map_err(|cause| {
+        PoseError::of(path, format_args!("{cause}; export the file again with nerfstudio"))
+    })?;
     let folder = parent(path)?;
     let mut frames = Frames {
         paths: transforms.frames.iter().map(|frame| frame.file_path.replace('\\', "/")).collect(),
@@ -96,7 +98,7 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
     for (index, (frame, name)) in transforms.frames.iter().zip(names).enumerate() {
         let place = Place::Frame(index);
         let image = frames.paths[index].clone();
-        let world_from_camera = match world_from_camera(frame, name.as_deref().unwrap_or(&image)) {
+        let world_from_camera = match world_from_camera(frame) {
             Ok(found) => found,
             Err(problem) => {
                 damaged.add(name.as_deref().unwrap_or(&image), problem, path, place);
@@ -104,29 +106,24 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
             }
         };
         let photo = frames.photo(index, name);
-        let photo = photo.ok_or_else(|| PoseProblem::UnsafeName { image }.at(path, place))?;
+        let photo = photo.ok_or_else(|| PoseProblem::unsafe_name(&image).at(path, place))?;
         let FramePhoto { name, image_path, elsewhere } = photo;
         let camera = frame.camera.clone().or(&transforms.camera);
-        let intrinsics = match camera.intrinsics(&name, &image_path) {
-            Ok(intrinsics) => intrinsics,
-            Err(problem @ PoseProblem::NoSize { .. }) => {
-                damaged.add(&name, problem, path, place);
-                continue;
-            }
-            Err(problem) => return Err(problem.at(path, place)),
+        let Some(size_px) = camera.size_px(&image_path) else {
+            let photo = image_path.display();
+            let fault = format!(
+                "its size is unknown: neither the frame nor the top of the file has w and h, and {photo} cannot be read"
+            );
+            let advice = "add them, or give the photos' folder with --images";
+            damaged.add(&name, PoseProblem::new(fault, advice), path, place);
+            continue;
         };
+        let intrinsics = camera.intrinsics(size_px).map_err(|problem| problem.at(path, place))?;
         views.push(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() });
         stated.push(elsewhere);
     }
-    let mut notes: Vec<String> = take_back_shared(&mut views, &mut stated).into_iter().collect();
-    let moved = views.iter().zip(&stated).filter_map(|(view, stated)| Some((view, stated.as_ref()?)));
-    let moved: Vec<String> =
-        moved.map(|(view, stated)| format!("{} for {}", view.image_path.display(), stated.said)).collect();
-    notes.extend(
-        moved
-            .first()
-            .map(|first| format!("{} photos are not where the file says; found {first}", moved.len())),
-    );
+    let moved = |n: usize, first: &str| format!("{n} photos are not where the file says; found {first}");
+    let mut notes = settle(&mut views, stated, moved);
     notes.extend(not_read(&transforms, &views));
     let applied = applied(&transforms, &folder).map_err(in_file)?;
     Ok(ViewSet { applied, notes, ..view_set(path, views, PoseSource::Transforms, damaged)? })
@@ -154,13 +151,12 @@ fn not_read(transforms: &Transforms, views: &[View]) -> Vec<String> {
     found
 }
 
-fn world_from_camera(frame: &FrameEntry, image: &str) -> Result<DAffine3, PoseProblem> {
-    let expected = "a transform_matrix of finite numbers";
-    let missing = |found: &str| PoseProblem::Expected { expected, found: found.to_owned() };
+fn world_from_camera(frame: &FrameEntry) -> Result<DAffine3, PoseProblem> {
+    let missing = |found| PoseProblem::expected("a transform_matrix of finite numbers", found);
     let matrix = frame.transform_matrix.as_ref().ok_or_else(|| missing("none"))?;
     let rows = finite(matrix).ok_or_else(|| missing("null or NaN"))?;
     let opencv_axes_in_opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-    affine_from_rows(image, &rows, opencv_axes_in_opengl)
+    affine_from_rows(&rows, opencv_axes_in_opengl)
 }
 
 /// Replaces NaN and infinities, which some writers put into JSON, with null.
@@ -224,11 +220,10 @@ impl Frames<'_> {
 fn applied(transforms: &Transforms, folder: &Path) -> Result<Option<AppliedTransform>, PoseProblem> {
     let scale = transforms.applied_scale.unwrap_or(1.0);
     if !(scale.is_finite() && scale > 0.0) {
-        let found = scale.to_string();
-        return Err(PoseProblem::Expected { expected: "an applied_scale above 0", found });
+        return Err(PoseProblem::expected("an applied_scale above 0", scale));
     }
     let transform = match &transforms.applied_transform {
-        Some(rows) => affine_from_rows("applied_transform", rows, DMat3::IDENTITY)?,
+        Some(rows) => affine_from_rows(rows, DMat3::IDENTITY)?,
         None if folder.join("colmap/sparse/0").is_dir() => DAffine3::from_mat3(COLMAP_AXES),
         None if transforms.applied_scale.is_some() => DAffine3::IDENTITY,
         None => return Ok(None),
@@ -322,22 +317,20 @@ impl Camera {
         }
     }
 
-    fn intrinsics(&self, image: &str, image_path: &Path) -> Result<Intrinsics, PoseProblem> {
-        let [width_px, height_px] = match (self.w, self.h) {
-            (Some(w), Some(h)) => [w, h],
-            // NeRF's first data sets state the size only in the images.
-            _ => photo::size_px(image_path).map(|(w, h)| [f64::from(w), f64::from(h)]).ok_or_else(|| {
-                PoseProblem::NoSize { image: image.to_owned(), photo: image_path.to_owned() }
-            })?,
-        };
+    /// NeRF's first data sets state the size only in the images.
+    fn size_px(&self, image_path: &Path) -> Option<[f64; 2]> {
+        let stated = self.w.zip(self.h).map(|(w, h)| [w, h]);
+        stated.or_else(|| photo::size_px(image_path).map(|(w, h)| [w, h].map(f64::from)))
+    }
+
+    fn intrinsics(&self, [width_px, height_px]: [f64; 2]) -> Result<Intrinsics, PoseProblem> {
         let focal = |length: Option<f64>, angle: Option<f64>, side_px: f64| {
             length.or_else(|| angle.filter(|a| *a > 0.0 && *a < PI).map(|a| 0.5 * side_px / (0.5 * a).tan()))
         };
         let focal_x_px = focal(self.fl_x, self.camera_angle_x, width_px).ok_or_else(|| {
-            PoseProblem::MissingIntrinsics {
-                image: image.to_owned(),
-                field: "fl_x, or camera_angle_x within 0..pi radians,",
-            }
+            let fault = "fl_x, or camera_angle_x within 0..pi radians, is missing, both in the frame and at the top of \
+                         the file";
+            PoseProblem::new(fault, "add it to one of them")
         })?;
         let focal_y_px = focal(self.fl_y, self.camera_angle_y, height_px).unwrap_or(focal_x_px);
         let centre_px = [self.cx.unwrap_or(0.5 * width_px), self.cy.unwrap_or(0.5 * height_px)];
@@ -353,8 +346,10 @@ impl Camera {
         let further = [(self.k5, "k5"), (self.k6, "k6"), (self.b1, "b1"), (self.b2, "b2")];
         let further = further.into_iter().find(|(value, _)| value.is_some_and(|value| value != 0.0));
         let fallback = if self.is_fisheye == Some(true) { "OPENCV_FISHEYE" } else { "OPENCV" };
-        let unsupported = |model: &str, with: &str| PoseProblem::UnsupportedLens {
-            model: format!("{model}{with}").chars().take(60).collect(),
+        let unsupported = |model: &str, with: &str| {
+            let model: String = format!("{model}{with}").chars().take(60).collect();
+            let advice = "undistort the images or export with OPENCV";
+            PoseProblem::new(format!("lens model {model} is not supported"), advice)
         };
         let model = self.camera_model.as_deref().unwrap_or(fallback);
         if let Some((_, key)) = further {

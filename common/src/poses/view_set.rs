@@ -64,8 +64,9 @@ pub(super) struct Damaged {
 impl Damaged {
     /// Adds a frame with a pose problem; if no frame remains, the first problem is reported as the file's.
     pub(super) fn add(&mut self, frame: &str, problem: PoseProblem, path: &Path, place: Place) {
-        self.frames.push((frame.to_owned(), problem.of_pose()));
-        self.first.get_or_insert_with(|| problem.at(path, place));
+        self.frames.push((frame.to_owned(), problem.fault.clone()));
+        let fault = format!("{frame:?}: {}", problem.fault);
+        self.first.get_or_insert_with(|| PoseProblem { fault, ..problem }.at(path, place));
     }
 
     /// Adds a frame without a pose, as programs write it for photos that they could not place.
@@ -81,12 +82,15 @@ pub(super) fn view_set(
     source: PoseSource,
     damaged: Damaged,
 ) -> Result<ViewSet, PoseError> {
+    let fail = |fault: &str, advice| PoseProblem::new(fault, advice).at(path, Place::File);
     if views.is_empty() {
-        return Err(damaged.first.unwrap_or_else(|| PoseProblem::NoViews.at(path, Place::File)));
+        let none = || fail("the file has no posed images", "check that the reconstruction succeeded");
+        return Err(damaged.first.unwrap_or_else(none));
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     if let Some(pair) = views.windows(2).find(|pair| pair[0].name == pair[1].name) {
-        return Err(PoseProblem::DuplicateImage { image: pair[0].name.clone() }.at(path, Place::File));
+        let fault = format!("two images have the name {:?}", pair[0].name);
+        return Err(fail(&fault, "remove or rename one of them"));
     }
     let (without_pose, notes) = Default::default();
     Ok(ViewSet { views, source, without_pose, damaged: damaged.frames, notes, applied: None })

@@ -1,8 +1,5 @@
 //! Checks the bytes of a shard before they are read, and keeps the places of its columns.
 
-use std::ops::Range;
-
-use bytemuck::Pod;
 use glam::DVec3;
 use half::f16;
 
@@ -15,10 +12,10 @@ use super::write::Additions;
 use crate::appearance::Appearance;
 use crate::container::{ContainerError, Layout, damaged, section_by_start};
 use crate::frames::Aabb;
-use crate::landmarks::LandmarksLayout;
-use crate::objects::ObjectsLayout;
-use crate::occupancy::OccupancyLayout;
-use crate::photo_poses::PhotoPosesLayout;
+use crate::landmarks::{self, Landmarks};
+use crate::objects::{self, Objects};
+use crate::occupancy::{self, Occupancy};
+use crate::photo_poses::{self, PhotoPoses};
 
 /// Largest length accepted: embeddings have unit length, components about that.
 const MAX_LENGTH: f32 = 4096.0;
@@ -43,23 +40,11 @@ impl ShardHeader {
     }
 }
 
+/// A checked shard: its header, and the places of its sections.
 #[derive(Clone, Debug)]
 pub struct ShardLayout {
     pub header: ShardHeader,
-    positions: Range<usize>,
-    centroid_starts: Range<usize>,
-    centroids: Range<usize>,
-    radii: Range<usize>,
-    basis: Option<[Range<usize>; 3]>,
-    residuals: Option<[Range<usize>; 5]>,
-    exact: Option<[Range<usize>; 2]>,
-    fine: Option<(ScoreErrors, [Range<usize>; 3])>,
-    packed_indices: Option<(IndicesHeader, Range<usize>)>,
-    objects: Option<ObjectsLayout>,
-    appearance: Option<[Range<usize>; 3]>,
-    occupancy: Option<OccupancyLayout>,
-    photo_poses: Option<PhotoPosesLayout>,
-    landmarks: Option<LandmarksLayout>,
+    layout: Layout,
 }
 
 impl ShardLayout {
@@ -69,49 +54,27 @@ impl ShardLayout {
         let header: ShardHeader = layout.value(bytes, section::HEADER, "header")?;
         let at_header = layout.find(section::HEADER).map_or(0, |range| range.start);
         check_header(&header).map_err(|what| damaged(at_header, what))?;
-        let check = Checker { bytes, layout: &layout, header, at_header };
-        let (n, k, m) =
-            (header.n_gaussians as usize, header.n_centroids as usize, header.n_components as usize);
-        let (centroid_starts, n_with_evidence) = check.centroid_starts()?;
-        Ok(Self {
-            header,
-            positions: match PositionForm::of(header.position_bits) {
-                PositionForm::Packed => layout.column::<u32>(section::POSITIONS, "positions", n)?,
-                PositionForm::Wide => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
-                PositionForm::Full => layout.column::<[u32; 3]>(section::POSITIONS, "positions", n)?,
-            },
-            centroid_starts,
-            centroids: layout.column::<i8>(section::CENTROIDS, "centroids", k * m)?,
-            radii: check.lengths(section::RADII, "radii", k)?,
-            basis: check.basis()?,
-            residuals: check.residuals(n_with_evidence)?,
-            exact: check.exact(n_with_evidence)?,
-            fine: check.fine(n_with_evidence)?,
-            packed_indices: check.packed_indices()?,
-            objects: ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?,
-            appearance: check.appearance()?,
-            occupancy: OccupancyLayout::check(bytes, &layout)?,
-            photo_poses: PhotoPosesLayout::check(bytes, &layout)?,
-            landmarks: LandmarksLayout::check(bytes, &layout)?,
-        })
+        Checker { bytes, layout: &layout, header, at_header }.check()?;
+        objects::check(bytes, &layout, header.n_gaussians, header.n_components as usize)?;
+        occupancy::check(bytes, &layout)?;
+        photo_poses::check(bytes, &layout)?;
+        landmarks::check(bytes, &layout)?;
+        Ok(Self { header, layout })
     }
 
     /// Returns the parts besides the columns of [`ShardLayout::view`]; `bytes` must be those checked.
     pub fn additions<'a>(&self, bytes: &'a [u8]) -> Additions<'a> {
-        let appearance = self.appearance.as_ref().map(|columns| {
-            let [colours, sizes, rotations] = columns.clone().map(|range| &bytes[range]);
-            Appearance {
-                colours: bytemuck::cast_slice(colours),
-                sizes: bytemuck::cast_slice(sizes),
-                rotations: bytemuck::cast_slice(rotations),
-            }
-        });
+        let layout = &self.layout;
         Additions {
-            objects: self.objects.as_ref().map(|objects| objects.view(bytes)),
-            appearance,
-            occupancy: self.occupancy.as_ref().map(|occupancy| occupancy.view(bytes)),
-            photo_poses: self.photo_poses.as_ref().map(|photos| photos.view(bytes)),
-            landmarks: self.landmarks.as_ref().map(|landmarks| landmarks.view(bytes)),
+            objects: Objects::of(bytes, layout),
+            appearance: layout.find(section::COLOURS).map(|_| Appearance {
+                colours: layout.slice(bytes, section::COLOURS),
+                sizes: layout.slice(bytes, section::SIZES),
+                rotations: layout.slice(bytes, section::ROTATIONS),
+            }),
+            occupancy: Occupancy::of(bytes, layout),
+            photo_poses: PhotoPoses::of(bytes, layout),
+            landmarks: Landmarks::of(bytes, layout),
         }
     }
 
@@ -121,45 +84,45 @@ impl ShardLayout {
     /// If `bytes` are shorter than those checked, or do not start at a 4-byte aligned address (mapped files and
     /// [`AlignedBytes`](crate::container::AlignedBytes) do).
     pub fn view<'a>(&self, bytes: &'a [u8]) -> ShardView<'a> {
-        fn cast<'a, T: Pod>(bytes: &'a [u8], range: &Range<usize>) -> &'a [T] {
-            bytemuck::cast_slice(&bytes[range.clone()])
-        }
+        let (layout, header) = (&self.layout, self.header);
+        let has = |id: u32| layout.find(id).is_some();
+        let fine = has(section::FINE).then(|| Fine {
+            errors: bytemuck::pod_read_unaligned(layout.slice(bytes, section::FINE_ERRORS)),
+            steps: layout.slice(bytes, section::FINE_STEPS),
+            scales: layout.slice(bytes, section::FINE_SCALES),
+            values: layout.slice(bytes, section::FINE),
+        });
         ShardView {
-            header: self.header,
-            positions: match PositionForm::of(self.header.position_bits) {
-                PositionForm::Packed => Positions::Packed(cast(bytes, &self.positions)),
-                PositionForm::Wide => Positions::Wide(cast(bytes, &self.positions)),
-                PositionForm::Full => Positions::Full(cast(bytes, &self.positions)),
+            header,
+            positions: match PositionForm::of(header.position_bits) {
+                PositionForm::Packed => Positions::Packed(layout.slice(bytes, section::POSITIONS)),
+                PositionForm::Wide => Positions::Wide(layout.slice(bytes, section::POSITIONS)),
+                PositionForm::Full => Positions::Full(layout.slice(bytes, section::POSITIONS)),
             },
-            centroid_starts: cast(bytes, &self.centroid_starts),
-            centroids: cast(bytes, &self.centroids),
-            radii: cast(bytes, &self.radii),
-            basis: self.basis.as_ref().map(|[mean, vectors, steps]| Basis {
-                mean: cast(bytes, mean),
-                vectors: cast(bytes, vectors),
-                steps: cast(bytes, steps),
+            centroid_starts: layout.slice(bytes, section::CENTROID_STARTS),
+            centroids: layout.slice(bytes, section::CENTROIDS),
+            radii: layout.slice(bytes, section::RADII),
+            basis: has(section::BASIS).then(|| Basis {
+                mean: layout.slice(bytes, section::MEAN),
+                vectors: layout.slice(bytes, section::BASIS),
+                steps: layout.slice(bytes, section::BASIS_STEPS),
             }),
-            residuals: self.residuals.as_ref().map(
-                |[subspace_starts, codewords, residual_scales, residual_norms, codes]| Residuals {
-                    subspace_starts: cast(bytes, subspace_starts),
-                    codewords: cast(bytes, codewords),
-                    residual_scales: cast(bytes, residual_scales),
-                    residual_norms: cast(bytes, residual_norms),
-                    codes: &bytes[codes.clone()],
-                },
-            ),
-            exact: self.exact.as_ref().map(|[indices, embeddings]| ExactColumns {
-                input_indices: cast(bytes, indices),
-                embeddings: cast(bytes, embeddings),
-                fine: self.fine.as_ref().map(|(errors, [steps, scales, values])| Fine {
-                    errors: *errors,
-                    steps: cast(bytes, steps),
-                    scales: cast(bytes, scales),
-                    values: cast(bytes, values),
-                }),
+            residuals: (header.n_subspaces > 0).then(|| Residuals {
+                subspace_starts: layout.slice(bytes, section::SUBSPACE_STARTS),
+                codewords: layout.slice(bytes, section::CODEWORDS),
+                residual_scales: layout.slice(bytes, section::RESIDUAL_SCALES),
+                residual_norms: layout.slice(bytes, section::RESIDUAL_NORMS),
+                codes: layout.slice(bytes, section::CODES),
             }),
-            packed_indices: (self.packed_indices.as_ref())
-                .map(|(header, words)| PackedIndices { header: *header, words: cast(bytes, words) }),
+            exact: has(section::EMBEDDINGS).then(|| ExactColumns {
+                input_indices: layout.slice(bytes, section::INPUT_INDICES),
+                embeddings: layout.slice(bytes, section::EMBEDDINGS),
+                fine,
+            }),
+            packed_indices: has(section::PACKED_INDICES).then(|| PackedIndices {
+                header: bytemuck::pod_read_unaligned(layout.slice(bytes, section::PACKED_INDICES_HEADER)),
+                words: layout.slice(bytes, section::PACKED_INDICES),
+            }),
         }
     }
 }
@@ -217,98 +180,92 @@ struct Checker<'a> {
     at_header: usize,
 }
 
-/// Errors of fine residuals; ranges of their steps, scales and values.
-type FineSections = (ScoreErrors, [Range<usize>; 3]);
-
 impl Checker<'_> {
+    fn check(&self) -> Result<(), ContainerError> {
+        let (layout, n) = (self.layout, self.header.n_gaussians as usize);
+        let (k, m) = (self.header.n_centroids as usize, self.header.n_components as usize);
+        match PositionForm::of(self.header.position_bits) {
+            PositionForm::Packed => layout.column::<u32>(section::POSITIONS, "positions", n)?,
+            PositionForm::Wide => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
+            PositionForm::Full => layout.column::<[u32; 3]>(section::POSITIONS, "positions", n)?,
+        };
+        // Every centroid has members: an empty one would cost time, and K <= N bounds memory.
+        let n_with_evidence = self.ascending(section::CENTROID_STARTS, "centroid starts", k + 1, n)?;
+        layout.column::<i8>(section::CENTROIDS, "centroids", k * m)?;
+        self.lengths(section::RADII, "radii", k)?;
+        self.basis()?;
+        self.residuals(n_with_evidence)?;
+        if self.has(section::EMBEDDINGS) {
+            layout.column::<u32>(section::INPUT_INDICES, "input indices", n)?;
+            let n_values = n_with_evidence * self.header.dim as usize;
+            self.halves(section::EMBEDDINGS, "embeddings", n_values)?;
+        }
+        if self.has(section::FINE) {
+            let errors: ScoreErrors =
+                layout.value(self.bytes, section::FINE_ERRORS, "errors of fine residuals")?;
+            check_errors(&errors).map_err(|what| damaged(self.at_header, what))?;
+            self.lengths(section::FINE_STEPS, "fine steps", m)?;
+            self.lengths(section::FINE_SCALES, "fine scales", k)?;
+            layout.column::<i8>(section::FINE, "fine residuals", n_with_evidence * m)?;
+        }
+        if self.has(section::PACKED_INDICES) {
+            self.packed_indices(n)?;
+        }
+        if self.has(section::COLOURS) {
+            layout.column::<[u8; 4]>(section::COLOURS, "colours", n)?;
+            layout.column::<[u8; 3]>(section::SIZES, "sizes", n)?;
+            layout.column::<[u8; 3]>(section::ROTATIONS, "rotations", n)?;
+        }
+        Ok(())
+    }
+
     fn has(&self, id: u32) -> bool {
         self.layout.find(id).is_some()
     }
 
-    /// Returns the place of the centroid starts, and the number of Gaussians with evidence.
-    fn centroid_starts(&self) -> Result<(Range<usize>, usize), ContainerError> {
-        // Every centroid has members: an empty one would cost time, and K <= N bounds memory.
-        let (k, most) = (self.header.n_centroids as usize, self.header.n_gaussians as usize);
-        self.ascending(section::CENTROID_STARTS, "centroid starts", k + 1, most)
-    }
-
-    /// Returns the place of numbers that ascend strictly from 0, and the last, which is at most `most`.
+    /// Checks numbers that ascend strictly from 0; returns the last, which is at most `most`.
     fn ascending(
         &self,
         id: u32,
         name: &'static str,
         len: usize,
         most: usize,
-    ) -> Result<(Range<usize>, usize), ContainerError> {
+    ) -> Result<usize, ContainerError> {
         let range = self.layout.column::<u32>(id, name, len)?;
         let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&self.bytes[range.clone()]);
         let last = starts[len - 1] as usize;
         if starts[0] != 0 || starts.windows(2).any(|w| w[0] >= w[1]) || last > most {
             return Err(damaged(range.start, format!("{name} do not ascend from 0 to at most {most}")));
         }
-        Ok((range, last))
+        Ok(last)
     }
 
-    fn basis(&self) -> Result<Option<[Range<usize>; 3]>, ContainerError> {
+    fn basis(&self) -> Result<(), ContainerError> {
         let (m, dim) = (self.header.n_components as usize, self.header.dim as usize);
         if !self.has(section::BASIS) {
             let what = format!("{m} components of {dim} without a basis, expected {dim}");
-            return if m == dim { Ok(None) } else { Err(damaged(self.at_header, what)) };
+            return if m == dim { Ok(()) } else { Err(damaged(self.at_header, what)) };
         }
-        let mean = self.halves(section::MEAN, "mean", dim)?;
-        let vectors = self.layout.column::<i8>(section::BASIS, "basis", m * dim)?;
-        Ok(Some([mean, vectors, self.lengths(section::BASIS_STEPS, "basis steps", m)?]))
+        self.halves(section::MEAN, "mean", dim)?;
+        self.layout.column::<i8>(section::BASIS, "basis", m * dim)?;
+        self.lengths(section::BASIS_STEPS, "basis steps", m)
     }
 
-    fn residuals(&self, n_with_evidence: usize) -> Result<Option<[Range<usize>; 5]>, ContainerError> {
+    fn residuals(&self, n_with_evidence: usize) -> Result<(), ContainerError> {
         let (k, n_subspaces) = (self.header.n_centroids as usize, self.header.n_subspaces as usize);
         if n_subspaces == 0 {
-            return Ok(None);
+            return Ok(());
         }
         let most = self.header.n_components as usize;
-        let (starts, covered) =
-            self.ascending(section::SUBSPACE_STARTS, "subspace starts", n_subspaces + 1, most)?;
-        let codewords = self.halves(section::CODEWORDS, "codewords", CODEWORDS * covered)?;
-        let scales = self.lengths(section::RESIDUAL_SCALES, "residual scales", k)?;
-        let norms = self.lengths(section::RESIDUAL_NORMS, "residual norms", k)?;
+        let covered = self.ascending(section::SUBSPACE_STARTS, "subspace starts", n_subspaces + 1, most)?;
+        self.halves(section::CODEWORDS, "codewords", CODEWORDS * covered)?;
+        self.lengths(section::RESIDUAL_SCALES, "residual scales", k)?;
+        self.lengths(section::RESIDUAL_NORMS, "residual norms", k)?;
         let n_codes = n_with_evidence.div_ceil(BLOCK) * BLOCK * n_subspaces / 2;
-        Ok(Some([
-            starts,
-            codewords,
-            scales,
-            norms,
-            self.layout.column::<u8>(section::CODES, "codes", n_codes)?,
-        ]))
+        self.layout.column::<u8>(section::CODES, "codes", n_codes).map(drop)
     }
 
-    fn exact(&self, n_with_evidence: usize) -> Result<Option<[Range<usize>; 2]>, ContainerError> {
-        if !self.has(section::EMBEDDINGS) {
-            return Ok(None);
-        }
-        let (n, dim) = (self.header.n_gaussians as usize, self.header.dim as usize);
-        let indices = self.layout.column::<u32>(section::INPUT_INDICES, "input indices", n)?;
-        Ok(Some([indices, self.halves(section::EMBEDDINGS, "embeddings", n_with_evidence * dim)?]))
-    }
-
-    fn fine(&self, n_with_evidence: usize) -> Result<Option<FineSections>, ContainerError> {
-        if !self.has(section::FINE) {
-            return Ok(None);
-        }
-        let (k, m) = (self.header.n_centroids as usize, self.header.n_components as usize);
-        let errors: ScoreErrors =
-            self.layout.value(self.bytes, section::FINE_ERRORS, "errors of fine residuals")?;
-        check_errors(&errors).map_err(|what| damaged(self.at_header, what))?;
-        let steps = self.lengths(section::FINE_STEPS, "fine steps", m)?;
-        let scales = self.lengths(section::FINE_SCALES, "fine scales", k)?;
-        let values = self.layout.column::<i8>(section::FINE, "fine residuals", n_with_evidence * m)?;
-        Ok(Some((errors, [steps, scales, values])))
-    }
-
-    fn packed_indices(&self) -> Result<Option<(IndicesHeader, Range<usize>)>, ContainerError> {
-        if !self.has(section::PACKED_INDICES) {
-            return Ok(None);
-        }
-        let n = self.header.n_gaussians as usize;
+    fn packed_indices(&self, n: usize) -> Result<(), ContainerError> {
         let header: IndicesHeader =
             self.layout.value(self.bytes, section::PACKED_INDICES_HEADER, "header of packed indices")?;
         let Some(n_words) = indices::n_words(n, header.width_bits) else {
@@ -318,43 +275,30 @@ impl Checker<'_> {
         };
         let range = self.layout.column::<u32>(section::PACKED_INDICES, "packed indices", n_words)?;
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(&self.bytes[range.clone()]);
-        PackedIndices { header, words: &words }.check(n).map_err(|what| damaged(range.start, what))?;
-        Ok(Some((header, range)))
+        PackedIndices { header, words: &words }.check(n).map_err(|what| damaged(range.start, what))
     }
 
-    fn appearance(&self) -> Result<Option<[Range<usize>; 3]>, ContainerError> {
-        if !self.has(section::COLOURS) {
-            return Ok(None);
-        }
-        let n = self.header.n_gaussians as usize;
-        Ok(Some([
-            self.layout.column::<[u8; 4]>(section::COLOURS, "colours", n)?,
-            self.layout.column::<[u8; 3]>(section::SIZES, "sizes", n)?,
-            self.layout.column::<[u8; 3]>(section::ROTATIONS, "rotations", n)?,
-        ]))
-    }
-
-    /// Returns the place of a column of lengths, each checked to be within `0..=MAX_LENGTH`.
-    fn lengths(&self, id: u32, name: &'static str, len: usize) -> Result<Range<usize>, ContainerError> {
+    /// Checks a column of lengths, each within `0..=MAX_LENGTH`.
+    fn lengths(&self, id: u32, name: &'static str, len: usize) -> Result<(), ContainerError> {
         let range = self.layout.column::<f32>(id, name, len)?;
-        let values = self.bytes[range.clone()].as_chunks().0;
-        if values.iter().any(|bytes| !(0.0..=MAX_LENGTH).contains(&f32::from_le_bytes(*bytes))) {
-            return Err(damaged(
-                range.start,
-                format!("a value of the {name} is not within 0..={MAX_LENGTH}"),
-            ));
+        let mut values = self.bytes[range.clone()].as_chunks().0.iter().map(|v| f32::from_le_bytes(*v));
+        match values.all(|value| (0.0..=MAX_LENGTH).contains(&value)) {
+            true => Ok(()),
+            false => {
+                let what = format!("a value of the {name} is not within 0..={MAX_LENGTH}");
+                Err(damaged(range.start, what))
+            }
         }
-        Ok(range)
     }
 
-    /// Returns the place of a column of half floats, each checked to be finite.
-    fn halves(&self, id: u32, name: &'static str, len: usize) -> Result<Range<usize>, ContainerError> {
+    /// Checks a column of half floats, each finite.
+    fn halves(&self, id: u32, name: &'static str, len: usize) -> Result<(), ContainerError> {
         let range = self.layout.column::<f16>(id, name, len)?;
         // Exponent bits all set is infinity or NaN (IEEE 754 binary16).
         let is_finite = |bytes: &[u8; 2]| u16::from_le_bytes(*bytes) & 0x7c00 != 0x7c00;
-        if !self.bytes[range.clone()].as_chunks().0.iter().all(is_finite) {
-            return Err(damaged(range.start, format!("a value of the {name} is not finite")));
+        match self.bytes[range.clone()].as_chunks().0.iter().all(is_finite) {
+            true => Ok(()),
+            false => Err(damaged(range.start, format!("a value of the {name} is not finite"))),
         }
-        Ok(range)
     }
 }

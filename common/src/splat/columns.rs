@@ -1,8 +1,9 @@
 //! The columns to read, and for how many Gaussians.
 
+use std::fmt::Display;
 use std::path::Path;
 
-use super::error::{Place, SplatError};
+use super::error::SplatError;
 use crate::Gaussians;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -30,7 +31,7 @@ const EXPANSION_FREE_BYTES: u64 = 32 << 20;
 /// Returns `count` if a compressed file of `len_bytes` can hold that many Gaussians.
 pub(super) fn plausible_count(
     path: &Path,
-    place: Place,
+    place: impl Display,
     count: u64,
     degree: u8,
     len_bytes: u64,

@@ -4,7 +4,7 @@
 use glam::DVec3;
 
 use super::columns::columns;
-use super::error::{Place, SplatError};
+use super::error::SplatError;
 use super::input::Input;
 use super::values::{dc_of_colour, unit_rotation};
 use crate::Gaussians;
@@ -15,12 +15,9 @@ const ROW_BYTES: usize = 32;
 pub(super) fn read(mut input: Input) -> Result<Gaussians, SplatError> {
     let len_bytes = input.len_bytes();
     if len_bytes == 0 || !len_bytes.is_multiple_of(ROW_BYTES as u64) {
-        return Err(SplatError::malformed(
-            input.path(),
-            Place::Byte(len_bytes - len_bytes % ROW_BYTES as u64),
-            "rows of 32 bytes",
-            format_args!("a file of {len_bytes} bytes"),
-        ));
+        let place = format_args!("byte {}", len_bytes - len_bytes % ROW_BYTES as u64);
+        let found = format_args!("a file of {len_bytes} bytes");
+        return Err(SplatError::malformed(input.path(), place, "rows of 32 bytes", found));
     }
     let count = (len_bytes / ROW_BYTES as u64) as usize;
     let mut out = columns(count, 0);

@@ -1,9 +1,10 @@
 //! A file that is read front to back and knows its offset and the bytes that remain.
 
+use std::fmt::Display;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-use super::error::{Place, SplatError};
+use super::error::SplatError;
 use crate::files;
 
 /// Makes system calls negligible, and is small compared with the columns.
@@ -21,20 +22,11 @@ impl Input {
         let file = files::open(path)?;
         let metadata = file.metadata()?;
         if !metadata.is_file() {
-            let format = "what is no file, such as a pipe or a device,".to_owned();
-            return Err(SplatError::Unsupported {
-                path: path.into(),
-                format,
-                advice: "write it into a file first",
-            });
+            let format = "what is no file, such as a pipe or a device,";
+            return Err(SplatError::unsupported(path, format, "write it into a file first"));
         }
-        let len_bytes = metadata.len();
-        Ok(Self {
-            reader: BufReader::with_capacity(BUFFER_BYTES, file),
-            path: path.into(),
-            len_bytes,
-            offset_bytes: 0,
-        })
+        let reader = BufReader::with_capacity(BUFFER_BYTES, file);
+        Ok(Self { reader, path: path.into(), len_bytes: metadata.len(), offset_bytes: 0 })
     }
 
     pub fn path(&self) -> &Path {
@@ -49,8 +41,12 @@ impl Input {
         self.len_bytes.saturating_sub(self.offset_bytes)
     }
 
-    pub fn place(&self) -> Place {
-        Place::Byte(self.offset_bytes)
+    pub fn place(&self) -> String {
+        format!("byte {}", self.offset_bytes)
+    }
+
+    pub fn malformed(&self, expected: impl Display, found: impl Display) -> SplatError {
+        SplatError::malformed(&self.path, self.place(), expected, found)
     }
 
     /// Returns up to `n` bytes without consuming them. Only for small `n` and a file just opened.
@@ -76,12 +72,9 @@ impl Input {
         if n <= self.remaining_bytes() {
             return Ok(());
         }
-        Err(SplatError::malformed(
-            &self.path,
-            self.place(),
-            format_args!("{n} bytes of {what}"),
-            format_args!("{} up to the end of the file", self.remaining_bytes()),
-        ))
+        let left = self.remaining_bytes();
+        let found = format_args!("{left} up to the end of the file");
+        Err(self.malformed(format_args!("{n} bytes of {what}"), found))
     }
 
     /// Checks that nothing but blanks remains.
@@ -93,8 +86,8 @@ impl Input {
                 return Ok(());
             }
             if !bytes.trim_ascii().is_empty() {
-                let left = format_args!("{} more bytes", self.remaining_bytes());
-                return Err(SplatError::malformed(&self.path, self.place(), "the end of the file", left));
+                let left = self.remaining_bytes();
+                return Err(self.malformed("the end of the file", format_args!("{left} more bytes")));
             }
             self.consume(n);
         }

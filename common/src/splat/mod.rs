@@ -25,7 +25,7 @@ mod spz;
 mod values;
 
 pub use columns::ReadOptions;
-pub use error::{Place, SplatError};
+pub use error::SplatError;
 use input::Input;
 
 /// Reads a splat file of any supported format.
@@ -42,7 +42,7 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Gaussians, SplatError>
     }
     let mut input = Input::open(path)?;
     if let Some((format, advice)) = files::stand_in(input.peek(64)?) {
-        return Err(SplatError::Unsupported { path: path.into(), format: format.into(), advice });
+        return Err(SplatError::unsupported(path, format, advice));
     }
     let start = input.peek(4)?.to_vec();
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
@@ -52,17 +52,15 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Gaussians, SplatError>
         (b"PK\x03\x04", _) => sog::read_bundle(path, *options),
         (_, "splat") => dot_splat::read(input),
         (_, "json") | ([b'{', ..], _) => sog::read_folder(path, *options),
-        (_, "ksplat") => Err(SplatError::Unsupported {
-            path: path.into(),
-            format: ".ksplat".into(),
-            advice: "convert it with `splat-transform FILE.ksplat FILE.ply` (npm @playcanvas/splat-transform)",
-        }),
-        _ => Err(SplatError::Malformed {
-            path: path.into(),
-            place: Place::Byte(0),
-            expected: "a PLY, SPZ, SOG or .splat file".into(),
-            found: format!("bytes {start:02x?}"),
-            advice: "give a Gaussian splat in one of these formats, or convert it to PLY",
-        }),
+        (_, "ksplat") => Err(SplatError::unsupported(
+            path,
+            ".ksplat",
+            "convert it with `splat-transform FILE.ksplat FILE.ply` (npm @playcanvas/splat-transform)",
+        )),
+        _ => {
+            let fault = format!("expected a PLY, SPZ, SOG or .splat file, found bytes {start:02x?}");
+            let advice = "give a Gaussian splat in one of these formats, or convert it to PLY";
+            Err(SplatError::at(path, "byte 0", format_args!("{fault}; {advice}")))
+        }
     }
 }

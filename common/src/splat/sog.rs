@@ -12,7 +12,7 @@ use serde::Deserialize;
 use zip::ZipArchive;
 
 use super::columns::{MAX_SH_DEGREE, ReadOptions, columns, plausible_count};
-use super::error::{Place, SplatError};
+use super::error::SplatError;
 use super::values::{sigmoid, unit_rotation, with_largest};
 use crate::{Gaussians, files};
 
@@ -139,13 +139,10 @@ pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians
     let file = files::open(path)?;
     let len_bytes = file.metadata()?.len();
     let archive = ZipArchive::new(BufReader::new(file))
-        .map_err(|source| SplatError::undecodable(path, Place::Byte(0), "the ZIP directory", source))?;
+        .map_err(|cause| SplatError::undecodable(path, "byte 0", "the ZIP directory", cause))?;
     if archive.index_for_name("meta.json").is_none() {
-        return Err(SplatError::Unsupported {
-            path: path.into(),
-            format: "a ZIP file without the meta.json of SOG".into(),
-            advice: "unpack it and give the splat inside",
-        });
+        let format = "a ZIP file without the meta.json of SOG";
+        return Err(SplatError::unsupported(path, format, "unpack it and give the splat inside"));
     }
     let mut sog = Sog { path: path.into(), parts: Parts::Bundle(Box::new(archive)), len_bytes };
     let meta = sog.meta("meta.json")?;
@@ -155,13 +152,8 @@ pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians
 impl Meta {
     fn files(&self) -> impl Iterator<Item = &String> {
         let rest = self.sh_rest.iter().flat_map(|sh| &sh.files);
-        self.means
-            .files
-            .iter()
-            .chain(&self.scales.files)
-            .chain(&self.quats.files)
-            .chain(&self.sh0.files)
-            .chain(rest)
+        let all = [&self.means.files[..], &self.scales.files, &self.quats.files, &self.sh0.files];
+        all.into_iter().flatten().chain(rest)
     }
 }
 
@@ -172,7 +164,11 @@ impl Sog {
         expected: impl std::fmt::Display,
         found: impl std::fmt::Display,
     ) -> SplatError {
-        SplatError::malformed(&self.path, Place::Part(part.into()), expected, found)
+        SplatError::malformed(&self.path, part, expected, found)
+    }
+
+    fn undecodable(&self, part: &str, what: &str, cause: impl std::fmt::Display) -> SplatError {
+        SplatError::undecodable(&self.path, part, what, cause)
     }
 
     /// Returns the path of a part, which must lie directly in the folder.
@@ -186,17 +182,13 @@ impl Sog {
 
     fn bytes(&mut self, part: &str, max_bytes: u64) -> Result<Vec<u8>, SplatError> {
         let mut bytes = Vec::new();
-        let failed = |path: &Path, source: std::io::Error| {
-            SplatError::undecodable(path, Place::Part(part.into()), "the part", source)
-        };
-        if let Parts::Folder(_) = self.parts {
+        if let Parts::Bundle(archive) = &mut self.parts {
+            let read = archive.by_name(part).map_err(std::io::Error::from);
+            let read = read.and_then(|entry| entry.take(max_bytes + 1).read_to_end(&mut bytes));
+            read.map_err(|cause| self.undecodable(part, "the part", cause))?;
+        } else {
             let file = files::open(&self.path_in_folder(part)?)?;
             file.take(max_bytes + 1).read_to_end(&mut bytes)?;
-        } else if let Parts::Bundle(archive) = &mut self.parts {
-            let entry = archive.by_name(part).map_err(|source| {
-                SplatError::undecodable(&self.path, Place::Part(part.into()), "the part", source)
-            })?;
-            entry.take(max_bytes + 1).read_to_end(&mut bytes).map_err(|source| failed(&self.path, source))?;
         }
         if bytes.len() as u64 > max_bytes {
             return Err(self.malformed(part, format_args!("at most {max_bytes} bytes"), "more"));
@@ -206,14 +198,8 @@ impl Sog {
 
     fn meta(&mut self, part: &str) -> Result<Meta, SplatError> {
         let bytes = self.bytes(part, MAX_META_BYTES)?;
-        let text = files::text_of(&bytes).map_err(|fault| SplatError::Text {
-            path: self.path.clone(),
-            place: Place::Part(part.into()),
-            fault,
-        })?;
-        serde_json::from_str(text).map_err(|source| {
-            SplatError::undecodable(&self.path, Place::Part(part.into()), "the meta data", source)
-        })
+        let text = files::text_of(&bytes).map_err(|fault| SplatError::at(&self.path, part, fault))?;
+        serde_json::from_str(text).map_err(|cause| self.undecodable(part, "the meta data", cause))
     }
 
     /// Returns the image at `index` of `files`; its number of pixels must lie in `n_pixels`.
@@ -231,17 +217,12 @@ impl Sog {
         if !is_lossless_webp(&bytes) {
             return Err(self.malformed(part, "a lossless WebP image", "another image"));
         }
-        let undecodable = |source| {
-            SplatError::undecodable(&self.path, Place::Part(part.clone()), "the image", Box::new(source))
-        };
+        let undecodable = |cause| self.undecodable(part, "the image", cause);
         let decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(undecodable)?;
         let (width, height) = decoder.dimensions();
         if !n_pixels.contains(&(u64::from(width) * u64::from(height))) {
-            return Err(self.malformed(
-                part,
-                format_args!("{} to {} pixels", n_pixels.start(), n_pixels.end()),
-                format_args!("{width} x {height}"),
-            ));
+            let expected = format_args!("{} to {} pixels", n_pixels.start(), n_pixels.end());
+            return Err(self.malformed(part, expected, format_args!("{width} x {height}")));
         }
         let channels = usize::from(decoder.color_type().channel_count());
         let mut image = vec![0; decoder.total_bytes() as usize];
@@ -260,13 +241,9 @@ impl Sog {
     ) -> Result<[[f64; 256]; N], SplatError> {
         let mut tables = [[0.0; 256]; N];
         for (channel, table) in tables.iter_mut().enumerate() {
-            *table = quantised.table(channel).ok_or_else(|| {
-                self.malformed(
-                    "meta.json",
-                    format_args!("`codebook`, or `mins` and `maxs`, in {name:?}"),
-                    "neither",
-                )
-            })?;
+            let expected = format_args!("`codebook`, or `mins` and `maxs`, in {name:?}");
+            let missing = || self.malformed("meta.json", expected, "neither");
+            *table = quantised.table(channel).ok_or_else(missing)?;
         }
         Ok(tables)
     }
@@ -276,11 +253,9 @@ impl Sog {
             None => meta.means.shape.as_ref().and_then(|shape| shape.first()).copied(),
             Some(2) => meta.count,
             Some(version) => {
-                return Err(SplatError::Unsupported {
-                    path: self.path.clone(),
-                    format: format!("SOG version {version}"),
-                    advice: "export it as SOG version 2, or as PLY",
-                });
+                let format = format_args!("SOG version {version}");
+                let advice = "export it as SOG version 2, or as PLY";
+                return Err(SplatError::unsupported(&self.path, format, advice));
             }
         };
         stated.ok_or_else(|| self.malformed("meta.json", "the number of Gaussians (`count`)", "none"))
@@ -289,9 +264,8 @@ impl Sog {
     fn decode(&mut self, meta: &Meta, options: ReadOptions) -> Result<Gaussians, SplatError> {
         let is_v1 = meta.version.is_none();
         let count = self.count(meta)?;
-        let place = Place::Part("meta.json".into());
         let degree = if options.with_sh_rest && meta.sh_rest.is_some() { MAX_SH_DEGREE } else { 0 };
-        let n = plausible_count(&self.path, place, count, degree, self.len_bytes)?;
+        let n = plausible_count(&self.path, "meta.json", count, degree, self.len_bytes)?;
         let n_pixels = count..=count.saturating_mul(2) + SPARE_PIXELS;
         let mut out = columns(n, 0);
 

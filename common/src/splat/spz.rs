@@ -12,7 +12,7 @@ use glam::DVec3;
 use ruzstd::decoding::{FrameDecoder, StreamingDecoder};
 
 use super::columns::{ReadOptions, columns, plausible_count};
-use super::error::{Place, SplatError};
+use super::error::SplatError;
 use super::input::Input;
 use super::values::{unit_rotation, with_largest};
 use crate::Gaussians;
@@ -47,7 +47,7 @@ impl Header {
     const BYTES: usize = 16;
 
     /// Parses and checks the header; `place` turns its offsets into places.
-    fn parse(path: &Path, raw: &[u8; Self::BYTES], place: fn(u64) -> Place) -> Result<Self, SplatError> {
+    fn parse(path: &Path, raw: &[u8; Self::BYTES], place: fn(u64) -> String) -> Result<Self, SplatError> {
         let word = |i: usize| u32::from_le_bytes([raw[i], raw[i + 1], raw[i + 2], raw[i + 3]]);
         let malformed = |offset, expected: &str, found: String| {
             Err(SplatError::malformed(path, place(offset), expected, found))
@@ -60,21 +60,14 @@ impl Header {
             flags: raw[14],
         };
         if raw.starts_with(b"ply") {
-            return Err(SplatError::Unsupported {
-                path: path.into(),
-                format: "a PLY in gzip".into(),
-                advice: "unpack it with `gunzip`",
-            });
+            return Err(SplatError::unsupported(path, "a PLY in gzip", "unpack it with `gunzip`"));
         }
         if !raw.starts_with(MAGIC) {
             return malformed(0, "the magic \"NGSP\" of SPZ", format!("{:02x?}", &raw[..4]));
         }
         if !(2..=4).contains(&header.version) {
-            return Err(SplatError::Unsupported {
-                path: path.into(),
-                format: format!("SPZ version {}", header.version),
-                advice: "export it as SPZ 2, 3 or 4, or as PLY",
-            });
+            let format = format_args!("SPZ version {}", header.version);
+            return Err(SplatError::unsupported(path, format, "export it as SPZ 2, 3 or 4, or as PLY"));
         }
         if header.sh_degree > 4 {
             return malformed(12, "a degree of spherical harmonics of 0 to 4", header.sh_degree.to_string());
@@ -116,13 +109,8 @@ impl Columns {
         let mut fields = |bytes: &[u8]| bytes.as_chunks::<N>().0.iter().for_each(|field| row(*field));
         match &mut self.payload {
             Payload::Whole { stream, offset_bytes } => {
-                read_rows(stream, total, row_bytes, &mut fields).map_err(|source| {
-                    SplatError::undecodable(
-                        &self.path,
-                        Place::DecompressedByte(*offset_bytes),
-                        "a column",
-                        source,
-                    )
+                read_rows(stream, total, row_bytes, &mut fields).map_err(|cause| {
+                    SplatError::undecodable(&self.path, decompressed(*offset_bytes), "a column", cause)
                 })?;
                 *offset_bytes += total;
                 Ok(())
@@ -138,6 +126,14 @@ impl Columns {
             }
         }
     }
+}
+
+fn byte(offset: u64) -> String {
+    format!("byte {offset}")
+}
+
+fn decompressed(offset: u64) -> String {
+    format!("byte {offset} of the decompressed data")
 }
 
 /// Reads `total` bytes in chunks of whole rows.
@@ -190,12 +186,12 @@ pub(super) fn read(mut input: Input, options: ReadOptions) -> Result<Gaussians, 
         let mut stream = GzDecoder::new(input);
         stream
             .read_exact(&mut raw)
-            .map_err(|source| SplatError::undecodable(&path, Place::Byte(0), "the gzip stream", source))?;
-        let header = Header::parse(&path, &raw, Place::DecompressedByte)?;
+            .map_err(|cause| SplatError::undecodable(&path, "byte 0", "the gzip stream", cause))?;
+        let header = Header::parse(&path, &raw, decompressed)?;
         return read_whole(path, header, Box::new(stream), len_bytes, options);
     }
     input.fill(&mut raw, "the SPZ header")?;
-    let header = Header::parse(&path, &raw, Place::Byte)?;
+    let header = Header::parse(&path, &raw, byte)?;
     if header.version < 4 {
         return read_whole(path, header, Box::new(input), len_bytes, options);
     }
@@ -203,7 +199,7 @@ pub(super) fn read(mut input: Input, options: ReadOptions) -> Result<Gaussians, 
     let row_bytes = header.row_bytes();
     let compressed_bytes = read_contents(&mut input, &raw, &header, &row_bytes)?;
     let degree = options.kept_degree(header.sh_degree);
-    let count = plausible_count(&path, Place::Byte(8), header.count, degree, len_bytes)?;
+    let count = plausible_count(&path, "byte 8", header.count, degree, len_bytes)?;
     let payload = Payload::Streams { input, compressed_bytes };
     decode(&header, &mut Columns { path, count, row_bytes, payload }, columns(count, degree))
 }
@@ -217,15 +213,10 @@ fn read_whole(
     options: ReadOptions,
 ) -> Result<Gaussians, SplatError> {
     if header.version > 3 {
-        return Err(SplatError::malformed(
-            &path,
-            Place::DecompressedByte(4),
-            "SPZ version 2 or 3 in gzip",
-            4,
-        ));
+        return Err(SplatError::malformed(&path, decompressed(4), "SPZ version 2 or 3 in gzip", 4));
     }
     let degree = options.kept_degree(header.sh_degree);
-    let count = plausible_count(&path, Place::DecompressedByte(8), header.count, degree, len_bytes)?;
+    let count = plausible_count(&path, decompressed(8), header.count, degree, len_bytes)?;
     let payload = Payload::Whole { stream, offset_bytes: Header::BYTES as u64 };
     let mut stored = Columns { path, count, row_bytes: header.row_bytes(), payload };
     let out = decode(&header, &mut stored, columns(count, degree))?;
@@ -235,7 +226,7 @@ fn read_whole(
     let Columns { path, payload: Payload::Whole { mut stream, offset_bytes }, .. } = stored else {
         unreachable!("built as a whole stream above");
     };
-    let place = Place::DecompressedByte(offset_bytes);
+    let place = decompressed(offset_bytes);
     if header.flags & FLAG_EXTENSIONS != 0 {
         check_extensions(&path, &place, &mut stream)?;
     }
@@ -261,28 +252,20 @@ fn read_contents(
     let path = input.path().to_path_buf();
     let n_streams = usize::from(raw[15]);
     if n_streams != row_bytes.len() {
-        return Err(SplatError::malformed(
-            &path,
-            Place::Byte(15),
-            format_args!("{} streams at degree {}", row_bytes.len(), header.sh_degree),
-            n_streams,
-        ));
+        let expected = format_args!("{} streams at degree {}", row_bytes.len(), header.sh_degree);
+        return Err(SplatError::malformed(&path, "byte 15", expected, n_streams));
     }
     let mut rest = [0; 16];
     input.fill(&mut rest, "the SPZ header")?;
     let toc_offset = u32::from_le_bytes([rest[0], rest[1], rest[2], rest[3]]);
     let Some(extension_bytes) = toc_offset.checked_sub(32) else {
-        return Err(SplatError::malformed(
-            &path,
-            Place::Byte(16),
-            "a table of contents from byte 32 on",
-            toc_offset,
-        ));
+        let expected = "a table of contents from byte 32 on";
+        return Err(SplatError::malformed(&path, "byte 16", expected, toc_offset));
     };
     input.require(extension_bytes.into(), "extensions")?;
     let mut extensions = input.take(extension_bytes.into());
     if header.flags & FLAG_EXTENSIONS != 0 {
-        check_extensions(&path, &Place::Byte(32), &mut extensions)?;
+        check_extensions(&path, "byte 32", &mut extensions)?;
     }
     let left = extensions.limit();
     input.skip(left, "extensions")?;
@@ -296,12 +279,8 @@ fn read_contents(
             [0, 8].map(|at| u64::from_le_bytes(std::array::from_fn(|i| sizes[at + i])));
         let expected = *bytes as u64 * header.count;
         if decompressed != expected {
-            return Err(SplatError::malformed(
-                &path,
-                place,
-                format_args!("a stream of {expected} bytes"),
-                decompressed,
-            ));
+            let expected = format_args!("a stream of {expected} bytes");
+            return Err(SplatError::malformed(&path, place, expected, decompressed));
         }
         compressed_bytes.push_back(compressed);
     }
@@ -311,8 +290,8 @@ fn read_contents(
 }
 
 /// Reads extension records (type, length, content) to the end; refuses coordinate systems other than right, up, back.
-fn check_extensions(path: &Path, place: &Place, stream: &mut impl Read) -> Result<(), SplatError> {
-    let failed = |source| SplatError::undecodable(path, place.clone(), "the extensions", source);
+fn check_extensions(path: &Path, place: &str, stream: &mut impl Read) -> Result<(), SplatError> {
+    let failed = |cause| SplatError::undecodable(path, place, "the extensions", cause);
     loop {
         let mut head = Vec::new();
         stream.take(8).read_to_end(&mut head).map_err(failed)?;
@@ -323,11 +302,9 @@ fn check_extensions(path: &Path, place: &Place, stream: &mut impl Read) -> Resul
             content.read_exact(&mut system).map_err(failed)?;
             let system = u32::from_le_bytes(system);
             if system != 0 && system != RIGHT_UP_BACK {
-                return Err(SplatError::Unsupported {
-                    path: path.into(),
-                    format: format!("SPZ coordinate system {system}"),
-                    advice: "export it with the axes right, up, back (RUB), or as PLY",
-                });
+                let format = format_args!("SPZ coordinate system {system}");
+                let advice = "export it with the axes right, up, back (RUB), or as PLY";
+                return Err(SplatError::unsupported(path, format, advice));
             }
         }
         io::copy(&mut content, &mut io::sink()).map_err(failed)?;

@@ -2,24 +2,22 @@
 
 use serde_json::Value;
 
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the number {found} is not a whole number of 64 bits, the only kind that canonical JSON has")]
-pub struct NotCanonical {
-    pub found: String,
-}
-
-pub fn canonical_json(value: &Value) -> Result<Vec<u8>, NotCanonical> {
+pub fn canonical_json(value: &Value) -> Result<Vec<u8>, String> {
     let mut out = Vec::new();
     write(value, &mut out)?;
     Ok(out)
 }
 
-fn write(value: &Value, out: &mut Vec<u8>) -> Result<(), NotCanonical> {
+fn write(value: &Value, out: &mut Vec<u8>) -> Result<(), String> {
     match value {
         Value::Null => out.extend(b"null"),
         Value::Bool(flag) => out.extend(flag.to_string().bytes()),
         Value::Number(number) if number.is_i64() || number.is_u64() => out.extend(number.to_string().bytes()),
-        Value::Number(number) => return Err(NotCanonical { found: number.to_string() }),
+        Value::Number(number) => {
+            return Err(format!(
+                "the number {number} is not a whole number of 64 bits, the only kind that canonical JSON has"
+            ));
+        }
         Value::String(text) => write_text(text, out),
         Value::Array(items) => {
             out.push(b'[');

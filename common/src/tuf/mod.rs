@@ -20,7 +20,6 @@ mod time;
 mod trusted;
 mod update;
 
-pub use canonical::{NotCanonical, canonical_json};
 pub use error::TufError;
 pub use metadata::{
     Body, FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, sha256_hex,

@@ -61,7 +61,7 @@ impl<T: Body> SignedMetadata<T> {
         let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
         let Envelope { signatures, signed } =
             serde_json::from_slice(bytes).map_err(|e| refuse(in_place_of_json(bytes, &e)))?;
-        let canonical = canonical_json(&signed).map_err(|e| refuse(e.to_string()))?;
+        let canonical = canonical_json(&signed).map_err(refuse)?;
         let head = Head::deserialize(&signed).map_err(|e| refuse(e.to_string()))?;
         if head.kind != T::TYPE {
             return Err(refuse(format!("its _type is {:?}, expected {:?}", head.kind, T::TYPE)));
@@ -162,7 +162,7 @@ pub fn add_signatures(role: &str, bytes: &[u8], keys: &[SigningKey]) -> Result<V
     let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
     let Envelope { mut signatures, signed } =
         serde_json::from_slice(bytes).map_err(|e| refuse(e.to_string()))?;
-    let canonical = canonical_json(&signed).map_err(|e| refuse(e.to_string()))?;
+    let canonical = canonical_json(&signed).map_err(refuse)?;
     for key in keys {
         let keyid = Key::of(key).id();
         if signatures.iter().all(|signature| signature.keyid != keyid) {

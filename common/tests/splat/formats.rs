@@ -4,10 +4,10 @@
 use std::io::Read;
 
 use serde_json::Value;
-use slag_common::splat::{ReadOptions, SplatError, read};
+use slag_common::splat::{ReadOptions, read};
 
 use super::generated::gzip;
-use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
+use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_well, refused, shared};
 
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().into_iter().flatten().map(|v| v.as_f64().expect("a number")).collect()
@@ -148,12 +148,10 @@ fn trained_scenes_row_by_row() {
 
 #[test]
 fn a_dot_splat_with_an_incomplete_row_is_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
     for (len, row) in [(0, 0), (63, 32), (65, 64)] {
-        let error = super::read_bytes(folder.path(), "cut.splat", &vec![1; len]).expect_err("is refused");
         let expected =
             format!("cut.splat: byte {row}: expected rows of 32 bytes, found a file of {len} bytes");
-        assert!(error.to_string().contains(&expected), "{error}");
+        refused("cut.splat", &vec![1; len], &[&expected]);
     }
 }
 
@@ -162,14 +160,12 @@ fn a_dot_splat_with_an_incomplete_row_is_refused() {
 fn refusals_give_advice() {
     let folder = shared("fixtures/formats");
     let error = read_all(&folder.join("minimal.ksplat")).expect_err("is refused");
-    assert!(matches!(error, SplatError::Unsupported { .. }));
     let text = error.to_string();
     assert!(text.contains("minimal.ksplat: .ksplat is not supported; convert it"), "{text}");
     let error = read_all(&folder.join("README.md")).expect_err("is refused");
     assert!(error.to_string().contains("README.md: byte 0: expected a PLY"), "{error}");
-    let error = read_all(&folder.join("absent.ply")).expect_err("is refused");
-    assert!(matches!(error, SplatError::Io { .. }));
-    assert!(error.to_string().contains("absent.ply"), "{error}");
+    let error = read_all(&folder.join("absent.ply")).expect_err("is refused").to_string();
+    assert!(error.contains("absent.ply") && error.contains("check the path"), "{error}");
 }
 
 #[test]
@@ -184,7 +180,6 @@ fn a_missing_file_is_named_once() {
 #[needs_shared]
 #[test]
 fn files_that_go_on_behind_their_last_row_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
     let fixture =
         |name: &str| std::fs::read(shared("fixtures/formats").join(name)).expect("the fixture is there");
     let spz = fixture("playbot_lod6_v3.spz");
@@ -199,12 +194,10 @@ fn files_that_go_on_behind_their_last_row_are_refused() {
         ("packed.ply", longer(&fixture("playbot_lod6.compressed.ply"))),
         ("whole.spz", gzip(&longer(&content))),
     ] {
-        let error = read_bytes(folder.path(), name, &bytes).expect_err(name).to_string();
-        assert!(error.contains("expected the end of the"), "{error}");
+        refused(name, &bytes, &["expected the end of the"]);
     }
-    read_bytes(folder.path(), "blank.ply", &[&plain[..], b"\n"].concat()).expect("reads");
+    read_well("blank.ply", &[&plain[..], b"\n"].concat());
     let (from, to) = ("property float opacity\n", "property float opacity\nproperty float opacity\n");
     let twice = String::from_utf8(ascii).expect("text").replacen(from, to, 1);
-    let error = read_bytes(folder.path(), "twice.ply", twice.as_bytes()).expect_err("is refused").to_string();
-    assert!(error.contains("a property that the element does not have yet"), "{error}");
+    refused("twice.ply", twice.as_bytes(), &["a property that the element does not have yet"]);
 }

@@ -9,7 +9,7 @@ use image::codecs::webp::WebPEncoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use slag_test_support::memory_of;
 
-use super::{assert_near, read_all, read_bytes};
+use super::{assert_near, read_all, read_bytes, read_well, refused};
 
 pub fn gzip(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
@@ -70,15 +70,13 @@ fn basis([x, y, z]: [f64; 3]) -> [f64; 15] {
 /// Oracle: the colour along a direction does not change when the axes turn.
 #[test]
 fn spz_harmonics_turn_with_the_axes() {
-    let folder = tempfile::tempdir().expect("a folder");
     for (degree, n) in [(1, 3), (2, 8), (3, 15), (4, 24)] {
         let sh: Vec<u8> = (0..3 * n).map(|i| (i * 37 % 251) as u8).collect();
         let (mut whole, columns) = spz_columns(3, degree, &sh);
         whole.extend(columns.concat());
-        let gz = read_bytes(folder.path(), "3.spz", &gzip(&whole)).unwrap_or_else(|e| panic!("{e}"));
-        let zstd =
-            read_bytes(folder.path(), "4.spz", &spz_v4(degree, &sh, &[])).unwrap_or_else(|e| panic!("{e}"));
-        let bare = read_bytes(folder.path(), "bare.spz", &whole).unwrap_or_else(|e| panic!("{e}"));
+        let gz = read_well("3.spz", &gzip(&whole));
+        let zstd = read_well("4.spz", &spz_v4(degree, &sh, &[]));
+        let bare = read_well("bare.spz", &whole);
         assert_eq!((&gz, &bare), (&zstd, &zstd));
         assert_eq!(gz.means_in_world, [glam::DVec3::new(1.0, -2.0, -3.0)]);
         assert_eq!((gz.sh_degree, gz.opacities[0], gz.scales[0]), (degree.min(3), 1.0, [1.0; 3]));
@@ -97,7 +95,6 @@ fn spz_harmonics_turn_with_the_axes() {
 
 #[test]
 fn spz_in_other_axes_is_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
     let record = |kind: u32, system: u32| [kind, 4, system].map(u32::to_le_bytes).concat();
     let other = [record(0xADBE_0002, 9), record(0xADBE_0003, 6)].concat();
     let same = [record(0xADBE_0002, 9), record(0xADBE_0003, 4)].concat();
@@ -110,55 +107,47 @@ fn spz_in_other_axes_is_refused() {
         gzip(&whole)
     };
     for bytes in [spz_v4(0, &[], &same), legacy(&same)] {
-        read_bytes(folder.path(), "same.spz", &bytes).unwrap_or_else(|e| panic!("{e}"));
+        read_well("same.spz", &bytes);
     }
     for bytes in [spz_v4(0, &[], &other), legacy(&other)] {
-        let error = read_bytes(folder.path(), "other.spz", &bytes).expect_err("is refused").to_string();
-        assert!(error.contains("other.spz: SPZ coordinate system 6 is not supported; export it"), "{error}");
+        refused("other.spz", &bytes, &["other.spz: SPZ coordinate system 6 is not supported; export it"]);
     }
 }
 
 #[test]
 fn wrong_checksums_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
     let (mut whole, columns) = spz_columns(3, 0, &[]);
     whole.extend(columns.concat());
     let (gz, zstd) = (gzip(&whole), spz_v4(0, &[], &[]));
     // The checksum is 8 bytes before the end of a gzip file, and at the end of a Zstandard frame.
     for (bytes, from_end) in [(gz, 8), (zstd, 4)] {
-        read_bytes(folder.path(), "intact.spz", &bytes).unwrap_or_else(|e| panic!("{e}"));
+        read_well("intact.spz", &bytes);
         let mut wrong = bytes.clone();
         wrong[bytes.len() - from_end] ^= 1;
-        let error = read_bytes(folder.path(), "wrong.spz", &wrong).expect_err("is refused").to_string();
-        assert!(error.contains("wrong.spz: byte ") && error.contains("cannot be decompressed"), "{error}");
+        refused("wrong.spz", &wrong, &["wrong.spz: byte ", "cannot be decompressed"]);
     }
 }
 
 #[test]
 fn false_counts_are_refused_before_memory_is_reserved() {
-    let folder = tempfile::tempdir().expect("a folder");
     let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
     let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
     for encoding in ["ascii", "binary_little_endian"] {
         for count in ["2", "4294967295", "18446744073709551615"] {
             let text =
                 format!("ply\nformat {encoding} 1.0\nelement vertex {count}\n{floats}end_header\n1 2 3\n");
-            let error =
-                read_bytes(folder.path(), "a.ply", text.as_bytes()).expect_err("is refused").to_string();
-            assert!(error.contains("a.ply: byte ") && error.contains(count), "{error}");
+            refused("a.ply", text.as_bytes(), &["a.ply: byte ", count]);
         }
     }
     let (mut header, columns) = spz_columns(3, 0, &[]);
     header[8..12].copy_from_slice(&u32::MAX.to_le_bytes());
-    let error = read_bytes(folder.path(), "a.spz", &gzip(&[header, columns.concat()].concat()));
-    let error = error.expect_err("is refused").to_string();
-    assert!(error.contains("Gaussians in") && error.contains("4294967295"), "{error}");
+    let bytes = gzip(&[header, columns.concat()].concat());
+    refused("a.spz", &bytes, &["Gaussians in", "4294967295"]);
 }
 
 /// Streams that inflate far beyond the table of contents are refused without being held in memory.
 #[test]
 fn zstandard_bombs_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
     for (log_window, expected) in [(23, "more than the 1 bytes"), (30, "window_size")] {
         let (mut out, columns) = spz_columns(4, 0, &[]);
         out.extend(32_u32.to_le_bytes());
@@ -178,7 +167,7 @@ fn zstandard_bombs_are_refused() {
             out.extend((column.len() as u64).to_le_bytes());
         }
         out.extend(streams.concat());
-        let (result, taken) = memory_of(|| read_bytes(folder.path(), "bomb.spz", &out));
+        let (result, taken) = memory_of(|| read_bytes("bomb.spz", &out));
         let error = result.expect_err("is refused").to_string();
         assert!(error.contains("bomb.spz: byte ") && error.contains(expected), "{error}");
         assert!(taken.peak_bytes < 40 << 20, "{taken:?}");

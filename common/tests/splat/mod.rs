@@ -15,10 +15,23 @@ fn read_all(path: &Path) -> Result<Gaussians, SplatError> {
     read(path, &ReadOptions { with_sh_rest: true })
 }
 
-fn read_bytes(folder: &Path, name: &str, bytes: &[u8]) -> Result<Gaussians, SplatError> {
-    let path = folder.join(name);
+fn read_bytes(name: &str, bytes: &[u8]) -> Result<Gaussians, SplatError> {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join(name);
     std::fs::write(&path, bytes).expect("the temporary folder can be written");
     read_all(&path)
+}
+
+#[track_caller]
+fn read_well(name: &str, bytes: &[u8]) -> Gaussians {
+    read_bytes(name, bytes).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// Asserts that the error has all these parts.
+#[track_caller]
+fn refused(name: &str, bytes: &[u8], parts: &[&str]) {
+    let error = read_bytes(name, bytes).expect_err("is refused").to_string();
+    assert!(parts.iter().all(|part| error.contains(part)), "{error}, expected {parts:?}");
 }
 
 fn assert_columns_agree(gaussians: &Gaussians) {

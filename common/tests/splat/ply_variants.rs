@@ -3,7 +3,8 @@
 use slag_common::Gaussians;
 use slag_common::splat::ply;
 
-use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
+use super::generated::gzip;
+use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_well, refused, shared};
 
 /// Returns the properties and rows of a plain PLY of floats, read by a separate parser.
 fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {
@@ -69,7 +70,6 @@ fn encodings_types_and_orders_give_the_same_gaussians() {
     let expected = read_all(&path).expect("reads");
     let (names, rows) = rows_of(&std::fs::read(&path).expect("is there"));
     assert_eq!((names.len(), rows.len()), (38, 1873));
-    let folder = tempfile::tempdir().expect("a folder");
     for (encoding, kind) in [
         ("binary_little_endian", "float"),
         ("binary_little_endian", "double"),
@@ -77,12 +77,12 @@ fn encodings_types_and_orders_give_the_same_gaussians() {
         ("binary_big_endian", "double"),
     ] {
         let bytes = variant(encoding, kind, &names, &rows);
-        let found = read_bytes(folder.path(), "variant.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
+        let found = read_well("variant.ply", &bytes);
         assert!(found == expected, "{encoding} {kind}");
     }
     // ASCII is read as f64, so values may differ in the last place of f32.
     let bytes = variant("ascii", "float", &names, &rows);
-    let found = read_bytes(folder.path(), "variant.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
+    let found = read_well("variant.ply", &bytes);
     assert_eq!((found.len(), found.sh_degree), (1873, 2));
     for i in 0..found.len() {
         assert!((found.means_in_world[i] - expected.means_in_world[i]).length() < 1e-6);
@@ -99,12 +99,11 @@ fn plain_colours_stand_in_for_harmonics() {
     let colours = |kind: &str| {
         ["red", "green", "blue"].map(|c| format!("property {kind} {c}\n")).concat() + "end_header\n"
     };
-    let folder = tempfile::tempdir().expect("a folder");
     for (kind, values) in
         [("uchar", "255 0 51"), ("ushort", "65535 0 13107"), ("float", "1 0 0.2"), ("float", "255 0 51")]
     {
         let text = format!("{header}{floats}{}1 2 3 0 2 0 0 0 0 0 0 {values}\n", colours(kind));
-        let found = read_bytes(folder.path(), "rgb.ply", text.as_bytes()).unwrap_or_else(|e| panic!("{e}"));
+        let found = read_well("rgb.ply", text.as_bytes());
         for (found, expected) in found.rgb_dc(0).into_iter().zip([1.0, 0.0, 0.2]) {
             assert_near(found.into(), expected, 1e-6, kind);
         }
@@ -119,21 +118,18 @@ fn rows_that_cannot_be_drawn_keep_their_place() {
     let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
     let rows = "-nan(ind) 0 0 0 1 0 0 0 0 0 0 0 0 0\n0 0 0 0 0 0 0 0 0 0 0 0 0 0\n\
                 0 0 0 inf 1 0 0 0 -inf 0 0 0 0 0\n0 0 0 0 1 0 0 0 inf 0 0 0 0 0\n";
-    let folder = tempfile::tempdir().expect("a folder");
     let text = format!("{header}{floats}end_header\n{rows}");
-    let found = read_bytes(folder.path(), "odd.ply", text.as_bytes()).unwrap_or_else(|e| panic!("{e}"));
+    let found = read_well("odd.ply", text.as_bytes());
     assert_eq!([0, 1, 2, 3].map(|i| found.is_usable(i)), [false, false, true, false]);
     assert_eq!((found.opacities[2], found.scales[2][0]), (1.0, 0.0));
 }
 
 #[test]
 fn missing_properties_are_named() {
-    let text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n\
-                property float z\nend_header\n1 2 3\n";
-    let folder = tempfile::tempdir().expect("a folder");
-    let error = read_bytes(folder.path(), "cloud.ply", text.as_bytes()).expect_err("is refused").to_string();
-    assert!(error.contains("cloud.ply: line 7: expected a header with property \"rot_0\""), "{error}");
-    assert!(error.ends_with("give the PLY of the splat"), "{error}");
+    let text = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n\
+                 property float z\nend_header\n1 2 3\n";
+    let parts = ["cloud.ply: line 7: expected a header with property \"rot_0\"", "give the PLY of the splat"];
+    refused("cloud.ply", text, &parts);
 }
 
 /// A compressed PLY with `n_chunks` chunks without colour ranges (as in the first version) and five Gaussians with
@@ -163,9 +159,8 @@ fn compressed(n_chunks: usize, sh: &[u8]) -> Vec<u8> {
 /// Oracle: PlayCanvas's description of the format, by hand.
 #[test]
 fn compressed_ply_by_hand() {
-    let folder = tempfile::tempdir().expect("a folder");
     let bytes = compressed(1, &[0, 1, 128, 254, 255]);
-    let found = read_bytes(folder.path(), "hand.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
+    let found = read_well("hand.ply", &bytes);
     assert_columns_agree(&found);
     let mean = found.means_in_world[4];
     assert_eq!((mean.x, mean.y), (0.0, -1.0));
@@ -191,8 +186,7 @@ fn compressed_ply_by_hand() {
         (compressed(0, &[0; 5]), "expected 1 chunks for 5 Gaussians, found 0"),
         (compressed(1, &[0; 4]), "expected 5 rows of element \"sh\", found 4"),
     ] {
-        let error = read_bytes(folder.path(), "wrong.ply", &bytes).expect_err("is refused").to_string();
-        assert!(error.contains("wrong.ply: byte ") && error.contains(expected), "{error}");
+        refused("wrong.ply", &bytes, &["wrong.ply: byte ", expected]);
     }
 }
 
@@ -267,44 +261,33 @@ fn one_row(properties: &[(&str, &str, f64)]) -> Vec<u8> {
 /// Flat Gaussians of 2DGS, colours of 0 to 1, harmonics of degree 4; other files are named.
 #[test]
 fn files_of_other_kinds_are_read_or_named() {
-    let dir = tempfile::tempdir().expect("a folder");
-    let path = dir.path().join("a.ply");
     let geometry = |float: &'static str| -> Vec<(&'static str, &'static str, f64)> {
         let names = ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "opacity"];
         names.into_iter().map(|name| (float, name, if name == "rot_0" { 1.0 } else { 0.0 })).collect()
     };
-    let read_back = |properties: &[(&str, &str, f64)]| {
-        std::fs::write(&path, one_row(properties)).expect("writes");
-        read_all(&path)
-    };
+    let read_back = |properties: &[(&str, &str, f64)]| read_well("a.ply", &one_row(properties));
     let device = read_all(std::path::Path::new("/dev/zero")).expect_err("no file").to_string();
     assert!(device.contains("write it into a file"), "{device}");
     let colours = [("float", "red", 1.0), ("float", "green", 0.5), ("float", "blue", 0.0)];
-    let flat = read_back(&[&geometry("float")[..], &colours].concat()).expect("2DGS");
+    let flat = read_back(&[&geometry("float")[..], &colours].concat());
     assert_eq!(flat.scales[0], [1.0, 1.0, 0.0]);
     for (found, expected) in flat.rgb_dc(0).into_iter().zip([1.0, 0.5, 0.0]) {
         assert_near(found.into(), expected, 1e-6, "colour");
     }
     // A single scale holds for all axes.
     let ball: Vec<_> = geometry("float").into_iter().filter(|(_, name, _)| *name != "scale_1").collect();
-    assert_eq!(read_back(&[&ball[..], &colours].concat()).expect("balls").scales[0], [1.0; 3]);
+    assert_eq!(read_back(&[&ball[..], &colours].concat()).scales[0], [1.0; 3]);
     let rest: Vec<String> = (0..72).map(|i| format!("f_rest_{i}")).collect();
     let mut fourth = [&geometry("float")[..], &[("float", "scale_2", 0.0)]].concat();
     fourth.extend((0..3).map(|i| ("float", ["f_dc_0", "f_dc_1", "f_dc_2"][i], 0.25)));
     fourth.extend(rest.iter().enumerate().map(|(i, name)| ("float", name.as_str(), i as f64)));
-    let fourth = read_back(&fourth).expect("degree 4");
+    let fourth = read_back(&fourth);
     assert_eq!((fourth.sh_degree, fourth.sh_rest.len()), (3, 45));
     // Channel by channel in the file, 24 each, of which 15 are kept.
     assert_eq!((fourth.sh_rest[..4].to_vec(), fourth.sh_rest[44]), (vec![0.0, 24.0, 48.0, 1.0], 62.0));
 
-    let refused = |bytes: &[u8]| {
-        std::fs::write(&path, bytes).expect("writes");
-        read_all(&path).expect_err("no splat").to_string()
-    };
-    assert!(refused(b"version https://git-lfs.github.com/spec/v1\n").contains("git lfs pull"));
-    assert!(refused(b"<!DOCTYPE html>").contains("web page"));
-    assert!(refused(&one_row(&geometry("float")[..3])).contains("point cloud"));
-    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
-    std::io::Write::write_all(&mut gzip, &one_row(&geometry("float"))).expect("memory");
-    assert!(refused(&gzip.finish().expect("memory")).contains("gunzip"));
+    refused("a.ply", b"version https://git-lfs.github.com/spec/v1\n", &["git lfs pull"]);
+    refused("a.ply", b"<!DOCTYPE html>", &["web page"]);
+    refused("a.ply", &one_row(&geometry("float")[..3]), &["point cloud"]);
+    refused("a.ply", &gzip(&one_row(&geometry("float"))), &["gunzip"]);
 }

@@ -13,7 +13,7 @@ use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde::de::DeserializeOwned;
 use serde::de::value::{Error, StrDeserializer};
-use slag_common::byte_size::{ByteSize, ByteSizeError};
+use slag_common::ByteSize;
 use slag_common::shard::Profile;
 use slag_models::commands::{self as model_commands, MODELS_HELP, RunArgs};
 use slag_models::hub::cache_folder;
@@ -165,7 +165,7 @@ pub(super) fn parse_reach(text: &str) -> Result<f64, String> {
 }
 
 /// Parses a number of bytes: 2GB, 2GiB or 2G.
-pub fn parse_bytes(text: &str) -> Result<u64, ByteSizeError> {
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
     text.parse::<ByteSize>().map(|size| size.0)
 }
 

@@ -195,14 +195,16 @@ impl Walk {
 
 #[cfg(test)]
 mod tests {
-    use slag_common::occupancy::{Block, BuiltOccupancy, VoxelState};
+    use std::collections::BTreeMap;
+
+    use slag_common::occupancy::{Block, BuiltOccupancy};
     use slag_math::random::Random;
 
     use super::*;
     use crate::goal::space::Window;
     use crate::score::Budget;
 
-    /// Oracle: the states of two shards' voxels, and every point beside every voxel, in the local table or not.
+    /// Oracle: the voxels of two shards' blocks, and every point beside every voxel, in the local table or not.
     #[test]
     fn voxels_around_a_thing_are_those_of_the_shards() {
         let mut random = Random::new(6);
@@ -210,6 +212,7 @@ mod tests {
         let all = (-3..3).flat_map(|x| (-3..3).flat_map(move |y| (-8..30).map(move |z| [x, y, z])));
         let blocks: Vec<Block> =
             all.map(|at| Block { at, occupied: 0, free: random.bits() | random.bits() }).collect();
+        let free: BTreeMap<[i32; 3], u64> = blocks.iter().map(|block| (block.at, block.free)).collect();
         let of_shard = |odd: bool| -> Vec<Block> {
             blocks.iter().copied().filter(|block| (block.at.iter().sum::<i32>() % 2 != 0) == odd).collect()
         };
@@ -231,7 +234,9 @@ mod tests {
             {
                 let on_lattice = [0, 1, 2].map(|axis| at[axis] + window.first[axis] * BLOCK_EDGE);
                 let is_inside = (0..3).all(|axis| at[axis] >= 0 && at[axis] < [n[0], n[1], HEIGHT][axis]);
-                let is_free = shards.iter().any(|shard| shard.state(on_lattice) == VoxelState::Free);
+                let [x, y, z] = on_lattice.map(|v| v.rem_euclid(BLOCK_EDGE));
+                let of_block = free.get(&on_lattice.map(|v| v.div_euclid(BLOCK_EDGE)));
+                let is_free = of_block.is_some_and(|free| free >> (z + 4 * (y + 4 * x)) & 1 == 1);
                 assert_eq!(thing.is_free(at), is_inside && is_free, "{at:?}");
                 let is_own = voxels.iter().any(|of| is_beside(of, at));
                 assert_eq!(thing.may_occupy(at), is_own, "{at:?}");

@@ -3,7 +3,6 @@
 use std::time::Instant;
 
 use serde::Serialize;
-use slag_math::simd::InstructionSet;
 use slag_math::stats::{Rank, quantile};
 
 /// The machine of a benchmark, as Linux names it.
@@ -11,12 +10,8 @@ use slag_math::stats::{Rank, quantile};
 pub(crate) struct Machine {
     pub(crate) cpu: String,
     pub(crate) n_threads: usize,
-    platform: String,
-    simd: &'static str,
     version: &'static str,
     is_debug_build: bool,
-    /// Load average of the last minute, this program's own work included.
-    load_1min: Option<f64>,
 }
 
 impl Machine {
@@ -28,31 +23,23 @@ impl Machine {
         Self {
             cpu: field(&info, "model name").or_else(board).unwrap_or_else(|| "unknown".into()),
             n_threads: rayon::current_num_threads(),
-            platform: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
-            simd: InstructionSet::widest().name(),
             version: env!("CARGO_PKG_VERSION"),
             is_debug_build: cfg!(debug_assertions),
-            load_1min: load_1min(),
         }
     }
 }
 
 impl std::fmt::Display for Machine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { cpu, n_threads, platform, simd, version, is_debug_build, .. } = self;
+        let Self { cpu, n_threads, version, is_debug_build } = self;
         let build = if *is_debug_build { "build with checks, as tests have" } else { "optimised build" };
-        write!(f, "{cpu}, {n_threads} threads, {simd}, {platform}; slag {version}, {build}")
+        write!(f, "{cpu}, {n_threads} threads; slag {version}, {build}")
     }
 }
 
 fn field(lines: &str, key: &str) -> Option<String> {
     let mut fields = lines.lines().filter_map(|line| line.split_once(':'));
     fields.find(|(found, _)| found.trim() == key).map(|(_, value)| value.trim().to_owned())
-}
-
-/// Linux only.
-pub(crate) fn load_1min() -> Option<f64> {
-    fs_err::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
 }
 
 /// Linux only.

@@ -12,7 +12,7 @@ use anyhow::{Context, Result, bail};
 use serde_json::Value;
 
 #[cfg(feature = "measure")]
-pub(crate) use prepared::{Prepared, fetch_all, flag_value, remove};
+pub(crate) use prepared::{Prepared, fetch_all, remove};
 
 pub(crate) fn sibling(name: &str) -> Result<PathBuf> {
     let lab = std::env::current_exe().context("cannot find the path of this program")?;

@@ -3,14 +3,13 @@
 use std::fs;
 
 use slag_common::ByteSize;
-use slag_common::byte_size::ByteSizeError;
 
 const MIN_MEMORY_BYTES: u64 = 64 << 20;
 /// For machines that do not report free memory.
 const UNKNOWN_MEMORY_BYTES: u64 = 2 << 30;
 
 pub(crate) fn parse_memory(text: &str) -> Result<u64, String> {
-    let ByteSize(bytes) = text.parse().map_err(|e: ByteSizeError| e.to_string())?;
+    let ByteSize(bytes) = text.parse()?;
     if bytes < MIN_MEMORY_BYTES {
         return Err(format!("{text:?} is too little; expected at least 64MiB"));
     }

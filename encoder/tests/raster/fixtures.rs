@@ -1,14 +1,15 @@
 //! Reads the shared test data.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DVec3};
-use npyz::{Deserialize, NpyFile};
-use slag_common::{Distortion, Gaussians, Intrinsics, View, npy, splat};
+use npyz::Deserialize;
+use slag_common::{Distortion, Gaussians, Intrinsics, View, splat};
 use slag_encoder::check::CheckView;
 use slag_encoder::ingest::load_image;
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
+use slag_test_support::npz_array;
 pub use slag_test_support::{needs_shared, shared};
 
 pub fn read_splat(root: &Path) -> Gaussians {
@@ -28,19 +29,18 @@ pub fn shrunk(photo: CheckView, width_px: u32) -> CheckView {
     CheckView { image, view: RasterView { intrinsics, ..photo.view }, ..photo }
 }
 
-pub struct Npz(npy::Npz);
+pub struct Npz(PathBuf);
 
 impl Npz {
     pub fn open(path: &str) -> Self {
-        Self(npy::Npz::open(&shared(path)).unwrap())
+        Self(shared(path))
     }
 
-    pub fn array<T: Deserialize>(&mut self, name: &str) -> Vec<T> {
-        let member = self.0.array(name).unwrap().unwrap_or_else(|| panic!("no array {name}"));
-        NpyFile::new(member).unwrap().into_vec().unwrap()
+    pub fn array<T: Deserialize>(&self, name: &str) -> Vec<T> {
+        npz_array(&self.0, name).1
     }
 
-    pub fn scene(&mut self, means_in_world: Vec<DVec3>) -> Gaussians {
+    pub fn scene(&self, means_in_world: Vec<DVec3>) -> Gaussians {
         let n = means_in_world.len();
         Gaussians {
             means_in_world,
@@ -54,7 +54,7 @@ impl Npz {
     }
 
     /// A camera with the archive's image size.
-    pub fn intrinsics(&mut self, matrix: &[f32]) -> Intrinsics {
+    pub fn intrinsics(&self, matrix: &[f32]) -> Intrinsics {
         Intrinsics {
             width_px: self.array::<i64>("width")[0] as u32,
             height_px: self.array::<i64>("height")[0] as u32,
@@ -66,7 +66,7 @@ impl Npz {
         }
     }
 
-    pub fn regions(&mut self, camera: &Intrinsics) -> RegionMap {
+    pub fn regions(&self, camera: &Intrinsics) -> RegionMap {
         let region_of_pixel: Vec<u32> = self.array::<u8>("labels").into_iter().map(u32::from).collect();
         RegionMap {
             width_px: camera.width_px,

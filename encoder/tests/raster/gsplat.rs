@@ -4,7 +4,7 @@ use super::backends::{Backend, backends};
 use super::fixtures::{Npz, needs_shared, points, view, widened};
 use super::table::{Weights as Sums, by_pair as sums};
 
-fn recorded(npz: &mut Npz, k: &str, l: &str, w: &str) -> Sums {
+fn recorded(npz: &Npz, k: &str, l: &str, w: &str) -> Sums {
     let (k, l, w) = (npz.array::<u16>(k), npz.array::<u8>(l), npz.array::<f64>(w));
     k.into_iter().zip(l).zip(w).map(|((k, l), w)| ((k.into(), l.into()), w)).collect()
 }
@@ -24,14 +24,14 @@ fn differences(found: &Sums, expected: &Sums) -> Sums {
 #[needs_shared]
 #[test]
 fn garden_weights_are_those_of_the_float64_reference() {
-    let mut npz = Npz::open("fixtures/gsplat_garden.npz");
+    let npz = Npz::open("fixtures/gsplat_garden.npz");
     let means = points(&npz.array("means"));
     let scene = npz.scene(means);
     let (poses, matrices) = (npz.array::<f32>("viewmats"), npz.array::<f32>("Ks"));
     for v in 0..3 {
         let camera = npz.intrinsics(&matrices[v * 9..]);
         let regions = npz.regions(&camera);
-        let expected = recorded(&mut npz, &format!("k{v}"), &format!("l{v}"), &format!("w64_{v}"));
+        let expected = recorded(&npz, &format!("k{v}"), &format!("l{v}"), &format!("w64_{v}"));
 
         let labels = npz.array::<f64>(&format!("label_sum64_{v}"));
         for Backend { name, rasterizer, keeps_order, .. } in backends() {
@@ -80,7 +80,7 @@ const GROUPS: [&str; 11] = [
 #[needs_shared]
 #[test]
 fn extremes_are_those_of_the_float64_reference_also_500_km_from_the_origin() {
-    let mut npz = Npz::open("fixtures/gsplat_extremes.npz");
+    let npz = Npz::open("fixtures/gsplat_extremes.npz");
     let groups = npz.array::<u8>("group");
     let matrix = npz.array::<f32>("K");
     let camera = npz.intrinsics(&matrix);
@@ -94,7 +94,7 @@ fn extremes_are_those_of_the_float64_reference_also_500_km_from_the_origin() {
     for (frame, (means, pose)) in [("local", local), ("offset", offset)] {
         let scene = npz.scene(means);
         let expected =
-            recorded(&mut npz, &format!("{frame}_k"), &format!("{frame}_l"), &format!("{frame}_w_ref64"));
+            recorded(&npz, &format!("{frame}_k"), &format!("{frame}_l"), &format!("{frame}_w_ref64"));
         for Backend { name, rasterizer, bound_factor, .. } in backends() {
             let found = sums(&rasterizer.weights(&scene, &view(&pose, camera), &regions).unwrap());
             let differences = differences(&found, &expected);

@@ -44,6 +44,16 @@ pub fn shared(path: &str) -> PathBuf {
     found
 }
 
+/// Returns the shape and the elements of an array in an npz file.
+pub fn npz_array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<usize>, Vec<T>) {
+    let file = std::fs::File::open(npz).expect("the npz is there");
+    let mut archive = zip::ZipArchive::new(file).expect("the npz opens");
+    let member = archive.by_name(&format!("{name}.npy")).unwrap_or_else(|_| panic!("no array {name}"));
+    let array = npyz::NpyFile::new(member).expect("an array");
+    let shape = array.shape().iter().map(|&n| n as usize).collect();
+    (shape, array.into_vec().expect("elements are of that type"))
+}
+
 /// The ONNX Runtime library that `scripts/setup.sh` installs.
 pub fn onnx_runtime() -> PathBuf {
     let library = format!("target/onnxruntime/{}/libonnxruntime.so", std::env::consts::ARCH);

@@ -9,10 +9,10 @@ use super::download::{HubOptions, client};
 use super::error::HubError;
 use super::lock::Lock;
 use super::pull::{Pull, PulledFile, Side};
-use super::table::{Entry, Table};
-use crate::described::Described;
-use crate::description::{self, DescriptionError, Sha256};
-use crate::model_dir::hash_file;
+use super::table::{Entry, Table, files_of};
+use crate::ModelError;
+use crate::description::{self, Sha256};
+use crate::model_dir::{hash_file, other_hash};
 
 /// The part of a model that is in the cache.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -31,8 +31,8 @@ pub struct Hub {
 }
 
 impl Hub {
-    pub fn new(options: HubOptions) -> Result<Self, HubError> {
-        Ok(Self { table: Table::embedded()?, options })
+    pub fn new(options: HubOptions) -> Self {
+        Self { table: Table::embedded(), options }
     }
 
     pub fn with_table(table: Table, options: HubOptions) -> Self {
@@ -48,8 +48,13 @@ impl Hub {
     }
 
     pub fn entry(&self, name: &str) -> Result<&Entry, HubError> {
-        let known = || self.table.models.iter().map(|entry| entry.name.clone()).collect();
-        self.table.find(name).ok_or_else(|| HubError::Unknown { name: name.to_owned(), known: known() })
+        self.table.find(name).ok_or_else(|| {
+            let known: Vec<&str> = self.table.models.iter().map(|entry| entry.name.as_str()).collect();
+            HubError::Other(format!(
+                "unknown model {name:?}; there are {}: choose one, or give the folder of your own model",
+                known.join(", ")
+            ))
+        })
     }
 
     /// Returns the part of a model that is in the cache, without reading files.
@@ -76,12 +81,17 @@ impl Hub {
     pub fn pull(&self, name: &str, side: Side, accepts_licence: bool) -> Result<Vec<PulledFile>, HubError> {
         let entry = self.entry(name)?;
         let root = &self.options.root;
-        if let Some(script) = entry.export.clone() {
-            let (name, folder) = (name.to_owned(), self.folder(entry));
-            return Err(HubError::NotExported { name, repository: entry.repository.clone(), script, folder });
+        if let Some(script) = &entry.export {
+            let (repository, folder) = (&entry.repository, self.folder(entry));
+            return Err(HubError::Other(format!(
+                "{name}: {repository} publishes weights, but no ONNX files; make them with `{script} {}` where PyTorch \
+                 and the hub can be reached, then use the model by its name",
+                folder.display()
+            )));
         }
         if side == Side::Text && entry.is_segmenter() {
-            return Err(HubError::NoTextSide { name: name.to_owned() });
+            let fault = "finds masks in photos, which a robot does not do; pull it with slag-encoder";
+            return Err(HubError::Other(format!("{name} {fault}")));
         }
         let mut lock = Lock::read(root)?;
         let was_accepted = lock.get(name).is_some_and(|accepted| accepted.licence == entry.licence);
@@ -99,7 +109,9 @@ impl Hub {
         // Another pull may have changed it.
         lock = Lock::read(root)?;
         lock.entry(name).licence.clone_from(&entry.licence);
-        let client = client(&self.options)?;
+        let client = client(&self.options).map_err(|fault| {
+            HubError::Other(format!("the proxy in HTTPS_PROXY: {fault}; correct or unset it"))
+        })?;
         let mut pull = Pull {
             table: &self.table,
             options: &self.options,
@@ -120,19 +132,17 @@ impl Hub {
 
     /// Compares the hash of every file with the recorded one.
     pub fn verify(folder: &Path) -> Result<Vec<String>, HubError> {
-        let described = Described::read(folder)?;
-        let root = folder.join(described.files_root());
+        let (root, files) = files_of(folder)?;
         let mut verified = Vec::new();
-        for (role, file) in described.files() {
+        for (role, file) in files {
             let path = root.join(&file.path);
             // Robots have only the text side.
             if role == "image.model" && file.sha256.is_some() && !path.exists() {
                 continue;
             }
-            let found = hash_file(&path).map_err(|cause| DescriptionError::Read { cause })?;
+            let found = hash_file(&path).map_err(|cause| ModelError::unreadable(&cause))?;
             if let Some(expected) = file.sha256.filter(|expected| expected.0 != found) {
-                let (expected, found) = (expected.to_string(), Sha256(found).to_string());
-                return Err(DescriptionError::Hash { path, expected, found }.into());
+                return Err(other_hash(&path, expected, Sha256(found)).into());
             }
             verified.push(file.path.display().to_string());
         }
@@ -145,7 +155,11 @@ impl Hub {
         match entry {
             // A folder without a model does not hide the name.
             Some(entry) if !name.join(description::FILE_NAME).is_file() => match self.here(entry) {
-                Here::No => Err(HubError::NotPulled { name: entry.name.clone() }),
+                Here::No => {
+                    let advice =
+                        format!("run `models pull {}`, or give the folder of your own model", entry.name);
+                    Err(HubError::Other(format!("{} is not pulled yet; {advice}", entry.name)))
+                }
                 _ => Ok(self.folder(entry)),
             },
             _ => Ok(name.to_owned()),

@@ -33,8 +33,9 @@ pub struct LockedFile {
 
 impl LockedFile {
     /// The error for a file with another hash.
-    pub(super) fn refusal(self, path: PathBuf, found: Sha256, advice: &'static str) -> HubError {
-        HubError::Hash { path, found, expected: self.sha256, by: self.hash_source, advice }
+    pub(super) fn refusal(&self, path: &Path, found: Sha256, advice: &str) -> HubError {
+        let (path, Self { sha256, hash_source }) = (path.display(), self);
+        HubError::Other(format!("{path}: SHA-256 is {found}, expected {sha256} ({hash_source}); {advice}"))
     }
 }
 
@@ -47,7 +48,10 @@ impl Lock {
     pub fn read(root: &Path) -> Result<Self, HubError> {
         let path = path_in(root);
         match fs_err::read(&path) {
-            Ok(bytes) => serde_json::from_slice(&bytes).map_err(|cause| HubError::Lock { path, cause }),
+            Ok(bytes) => serde_json::from_slice(&bytes).map_err(|cause| {
+                let path = path.display();
+                HubError::Other(format!("{path}: {cause}; correct it, or remove it and pull again"))
+            }),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Self::default()),
             Err(error) => Err(error.into()),
         }

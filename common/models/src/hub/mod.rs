@@ -12,7 +12,7 @@ mod table;
 
 pub use cache::{Here, Hub};
 pub use download::{HubOptions, MAX_FILE_BYTES};
-pub use error::{HubError, Source, Wanted};
+pub use error::{HubError, Source};
 pub use lock::{Accepted, Lock, LockedFile};
 pub use pull::{PulledFile, Side, cache_folder, models_folder};
 pub use table::{Entry, Known, Table};

@@ -6,7 +6,7 @@ use serde::Serialize;
 use slag_common::durable;
 
 use super::download::{Advertised, HubOptions, PartialFile, ask};
-use super::error::{HubError, Source, Wanted};
+use super::error::{HubError, Source};
 use super::lock::{Lock, LockedFile};
 use super::table::{Entry, Table};
 use crate::description::Sha256;
@@ -62,14 +62,16 @@ impl Pull<'_> {
         if let DownloadError::Io(error) = failure {
             return HubError::Io(error);
         }
-        let folder = &self.folder;
-        let paths = self.entry.paths(self.side == Side::Text).into_iter();
-        let wanted = paths.filter(|path| !folder.join(path).is_file()).map(|path| Wanted {
-            url: self.url(path),
-            path: folder.join(path),
-            sha256: self.expected(path).map(|expected| expected.sha256),
-        });
-        HubError::Unreachable { url: url.to_owned(), failure: Box::new(failure), wanted: wanted.collect() }
+        let mut text = format!("{url}: {failure}; try again, or place these files by hand:");
+        for path in self.entry.paths(self.side == Side::Text) {
+            let target = self.folder.join(path);
+            if !target.is_file() {
+                let hash = self.expected(path).map_or("unknown".into(), |of| of.sha256.to_string());
+                // A line per file; in one line they would be unreadable.
+                text += &format!("\n  {}\n    as {} (SHA-256 {hash})", self.url(path), target.display());
+            }
+        }
+        HubError::Other(text)
     }
 
     /// Requests a file's metadata, which must belong to the pulled commit.
@@ -79,7 +81,9 @@ impl Pull<'_> {
             let accepted = self.lock.entry(&self.entry.name);
             match self.entry.revision.clone().or(accepted.revision.clone()) {
                 Some(expected) if expected != found => {
-                    return Err(HubError::Revision { url: url.to_owned(), found, expected });
+                    return Err(HubError::Other(format!(
+                        "{url}: the hub serves commit {found}, expected {expected}; give another --hub"
+                    )));
                 }
                 _ => accepted.revision = Some(found),
             }
@@ -94,7 +98,10 @@ impl Pull<'_> {
                 continue;
             }
             let url = self.url(path);
-            let sha256 = self.ask(&url)?.sha256.ok_or(HubError::NoImageHash { url })?;
+            let fault = "the hub advertises no SHA-256 of the image model";
+            let advice = "pull the whole model with slag-encoder";
+            let sha256 = self.ask(&url)?.sha256;
+            let sha256 = sha256.ok_or_else(|| HubError::Other(format!("{url}: {fault}; {advice}")))?;
             self.accept(path, LockedFile { sha256, hash_source: Source::Hub })?;
         }
         Ok(())
@@ -118,7 +125,7 @@ impl Pull<'_> {
             },
         };
         if found != expected.sha256 {
-            return Err(expected.refusal(target, found, "remove the file and pull again"));
+            return Err(expected.refusal(&target, found, "remove the file and pull again"));
         }
         self.accept(path, expected.clone())?;
         let LockedFile { sha256, hash_source } = expected;
@@ -133,8 +140,11 @@ impl Pull<'_> {
         if let (Some(expected), Some(advertised)) = (&expected, advertised.sha256)
             && expected.sha256 != advertised
         {
-            let (expected, by) = (expected.sha256, expected.hash_source);
-            return Err(HubError::Advertised { url, advertised, expected, by });
+            let LockedFile { sha256, hash_source } = expected;
+            return Err(HubError::Other(format!(
+                "{url}: the hub advertises SHA-256 {advertised}, expected {sha256} ({hash_source}); do not use it, or \
+                 take the model out of models.lock if you trust the new one"
+            )));
         }
         let hub = advertised.sha256.map(|sha256| LockedFile { sha256, hash_source: Source::Hub });
         let stated = expected.or(hub);
@@ -157,7 +167,7 @@ impl Pull<'_> {
             // The part may belong to another version of the file: retry once from the start.
             if !was_begun {
                 let advice = "the download was discarded: pull again, or give another --hub";
-                return Err(expected.refusal(target.to_owned(), found, advice));
+                return Err(expected.refusal(target, found, advice));
             }
         }
     }

@@ -1,10 +1,13 @@
 //! The table of public models, kept as data in `models.toml`.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::description::Sha256;
+use crate::ModelError;
+use crate::description::{Description, FILE_NAME, FileRef, Sha256, read_toml};
+use crate::sam::SamDescription;
 
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -87,8 +90,8 @@ impl Entry {
 }
 
 impl Table {
-    pub fn embedded() -> Result<Self, Box<toml::de::Error>> {
-        toml::from_str(include_str!("../../models.toml")).map_err(Box::new)
+    pub fn embedded() -> Self {
+        toml::from_str(include_str!("../../models.toml")).expect("a test reads it")
     }
 
     pub fn find(&self, name: &str) -> Option<&Entry> {
@@ -119,16 +122,33 @@ impl Table {
     }
 }
 
+type Files = Vec<(&'static str, FileRef)>;
+
+/// Folder of a model's files, and these with their roles; a segmenter's description has `[segment]`.
+pub(super) fn files_of(folder: &Path) -> Result<(PathBuf, Files), ModelError> {
+    let path = folder.join(FILE_NAME);
+    let owned = |files: Vec<(&'static str, &FileRef)>| {
+        files.into_iter().map(|(role, file)| (role, file.clone())).collect()
+    };
+    Ok(match read_toml::<toml::Table>(&path)?.contains_key("segment") {
+        true => {
+            let segmenter = SamDescription::read(&path)?;
+            (folder.join(&segmenter.files_root), owned(segmenter.files()))
+        }
+        false => {
+            let encoders = Description::read(&path)?;
+            (folder.join(&encoders.files_root), owned(encoders.files()))
+        }
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::description::{Description, FileRef};
-    use crate::sam::SamDescription;
-
     /// Every entry has a valid description, a unique name, and no hashes of foreign files.
     #[test]
     fn every_entry_can_be_pulled() {
-        let table = Table::embedded().expect("it parses");
+        let table = Table::embedded();
         assert!(table.hub.starts_with("https://"));
         let folder = tempfile::tempdir().expect("a folder");
         for entry in &table.models {
@@ -146,22 +166,9 @@ mod tests {
             let path = folder.path().join("model.toml");
             let hash = Sha256([7; 32]);
             fs_err::write(&path, table.description(entry, &|_| Some(hash))).expect("it is writable");
-            let owned = |files: Vec<(&str, &FileRef)>| -> Vec<FileRef> {
-                files.into_iter().map(|(_, file)| file.clone()).collect()
-            };
-            let (found, files) = match entry.is_segmenter() {
-                true => {
-                    let description = SamDescription::read(&path).expect(name);
-                    (description.name.clone(), owned(description.files()))
-                }
-                false => {
-                    let description = Description::read(&path).expect(name);
-                    (description.name.clone(), owned(description.files()))
-                }
-            };
-            assert_eq!(&found, name);
-            assert!(files.iter().all(|file| file.sha256 == Some(hash)), "{name}");
-            let paths: Vec<_> = files.iter().map(|file| file.path.to_str().expect("UTF-8")).collect();
+            let (_, files) = files_of(folder.path()).expect(name);
+            assert!(files.iter().all(|(_, file)| file.sha256 == Some(hash)), "{name}");
+            let paths: Vec<_> = files.iter().map(|(_, file)| file.path.to_str().expect("UTF-8")).collect();
             assert_eq!(paths, entry.paths(false), "{name}");
         }
     }

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::description::{DescriptionError, FileRef, check_common, read_toml, require};
+use crate::ModelError;
+use crate::description::{FileRef, check_common, read_toml, require};
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -20,30 +21,19 @@ pub struct SamDescription {
     pub segment: SegmentDescription,
 }
 
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(tag = "kind", rename_all = "kebab-case")]
-pub enum SegmentDescription {
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SegmenterKind {
     /// Segment Anything: the photo keeps its proportions in the square; one feature map.
-    Sam(SamFiles),
+    Sam,
     /// Segment Anything 2 and its kin: the photo is stretched over the square; three feature maps.
-    Sam2(SamFiles),
-}
-
-impl SegmentDescription {
-    pub fn files(&self) -> &SamFiles {
-        match self {
-            Self::Sam(files) | Self::Sam2(files) => files,
-        }
-    }
-
-    pub fn is_stretched(&self) -> bool {
-        matches!(self, Self::Sam2(_))
-    }
+    Sam2,
 }
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct SamFiles {
+pub struct SegmentDescription {
+    pub kind: SegmenterKind,
     /// The model from an image to its embedding.
     pub image_encoder: FileRef,
     /// The model from points and the embedding to masks.
@@ -72,24 +62,22 @@ fn imagenet_std() -> [f64; 3] {
 }
 
 impl SamDescription {
-    pub fn read(path: &Path) -> Result<Self, DescriptionError> {
+    pub fn read(path: &Path) -> Result<Self, ModelError> {
         let description: Self = read_toml(path)?;
         check_common(path, &description.name, &description.files_root, &description.files())?;
-        let sam = description.segment.files();
-        let (size_px, expected) = (sam.size_px, "64 to 2048");
-        require(path, (64..=2048).contains(&size_px), "segment.size_px", size_px.to_string(), expected)?;
-        let finite = sam.mean.iter().all(|x| x.is_finite());
-        require(path, finite, "segment.mean", format!("{:?}", sam.mean), "three finite numbers")?;
-        let positive = sam.std.iter().all(|x| x.is_finite() && *x > 0.0);
-        require(path, positive, "segment.std", format!("{:?}", sam.std), "three numbers above 0")?;
+        let SegmentDescription { size_px, mean, std, .. } = &description.segment;
+        require(path, (64..=2048).contains(size_px), "segment.size_px", size_px, "64 to 2048")?;
+        let is_finite = mean.iter().all(|x| x.is_finite());
+        require(path, is_finite, "segment.mean", mean, "three finite numbers")?;
+        let is_positive = std.iter().all(|x| x.is_finite() && *x > 0.0);
+        require(path, is_positive, "segment.std", std, "three numbers above 0")?;
         Ok(description)
     }
 
     /// Files with their roles, each followed by separate weights.
     pub fn files(&self) -> Vec<(&'static str, &FileRef)> {
-        let files = self.segment.files();
-        let both =
-            [("segment.image_encoder", &files.image_encoder), ("segment.mask_decoder", &files.mask_decoder)];
+        let SegmentDescription { image_encoder, mask_decoder, .. } = &self.segment;
+        let both = [("segment.image_encoder", image_encoder), ("segment.mask_decoder", mask_decoder)];
         both.into_iter().flat_map(|(role, file)| file.parts().map(move |part| (role, part))).collect()
     }
 }

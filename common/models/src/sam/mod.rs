@@ -37,10 +37,10 @@ use crate::description::FILE_NAME;
 use crate::model_dir::{checked, sha256_of};
 use crate::placement::DeviceMemory;
 use crate::preprocess::{Filter, Window, resample, values_of_levels};
-use crate::session::{Model, SessionError, SessionOptions, Tensor};
+use crate::session::{Model, SessionOptions, Tensor};
 use crate::{Floats, ModelError};
 
-pub use description::{SamDescription, SamFiles, SegmentDescription};
+pub use description::{SamDescription, SegmentDescription, SegmenterKind};
 pub use names::MASKS_PER_PROMPT;
 
 /// An opened SAM. Each file runs one call at a time; the two files can run in parallel.
@@ -54,8 +54,8 @@ pub struct Sam {
     encoder: Mutex<Model>,
     decoder: Mutex<Model>,
     names: Names,
-    /// Memory of the GPU that runs both files, if one does: embeddings then stay there.
-    memory: Option<DeviceMemory>,
+    /// Where embeddings stay between the files: on the GPU that runs both, else with the processor.
+    memory: DeviceMemory,
     /// Prompts per call of the decoder, if it was opened for a fixed number.
     prompts_per_call: Option<usize>,
 }
@@ -63,28 +63,21 @@ pub struct Sam {
 #[derive(Debug)]
 pub struct Embedding {
     /// Tensors by the name of the decoder's input.
-    tensors: Vec<(String, Held)>,
+    tensors: Vec<(String, DynTensor)>,
     pub letterbox: Letterbox,
-}
-
-#[derive(Debug)]
-enum Held {
-    Host(Tensor),
-    /// On the decoder's GPU.
-    Device(DynTensor),
 }
 
 impl Embedding {
     /// Tensors in the processor's memory: name of the decoder's input, shape, values.
     pub fn tensors(&self) -> impl Iterator<Item = (&str, &[i64], &[f32])> {
-        self.tensors.iter().filter_map(|(name, held)| match held {
-            Held::Host(tensor) => Some((name.as_str(), &tensor.shape[..], &tensor.values[..])),
-            Held::Device(_) => None,
+        self.tensors.iter().filter_map(|(name, tensor)| {
+            let (shape, values) = tensor.try_extract_tensor::<f32>().ok()?;
+            Some((name.as_str(), &shape[..], values))
         })
     }
 }
 
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default)]
 pub struct Decoded {
     /// The model's estimate of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
     pub predicted_ious: Vec<f32>,
@@ -112,7 +105,7 @@ impl Sam {
         let description = SamDescription::read(&path)?;
         let files_root = dir.join(&description.files_root);
         let mut id = description.name.clone();
-        let sam = description.segment.files();
+        let sam = &description.segment;
         for file in [&sam.image_encoder, &sam.mask_decoder] {
             for part in file.parts() {
                 id = format!("{id} {}", hex::encode(sha256_of(&files_root, part)?));
@@ -128,11 +121,12 @@ impl Sam {
             decoder = Model::open_sized(&decoder_file, options, Some((&dimension, n as i64)))?;
             prompts_per_call = Some(n);
         }
-        let memory = encoder.memory.take().zip(decoder.memory.take()).map(|(memory, _)| memory);
+        let gpu = encoder.memory.take().zip(decoder.memory.take());
+        let memory = gpu.map_or_else(DeviceMemory::of_processor, |(memory, _)| memory);
         Ok(Self {
             id: format!("{id} {:?} {:?} {size_px} px", sam.mean, sam.std),
             size_px,
-            is_stretched: description.segment.is_stretched(),
+            is_stretched: sam.kind == SegmenterKind::Sam2,
             values: values_of_levels(sam.mean, sam.std),
             encoder: Mutex::new(encoder),
             decoder: Mutex::new(decoder),
@@ -173,26 +167,13 @@ impl Sam {
     }
 
     /// `image` must have pixels.
-    pub fn embed(&self, image: &RgbImage) -> Result<Embedding, SessionError> {
+    pub fn embed(&self, image: &RgbImage) -> Result<Embedding, ModelError> {
         let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
-        let shape = vec![1, 3, size, size];
-        let (name, links) = (self.names.pixels.as_str(), &self.names.embeddings);
+        let links = &self.names.embeddings;
         let mut encoder = self.encoder.lock().unwrap_or_else(PoisonError::into_inner);
-        let found: Vec<Held> = match &self.memory {
-            Some(memory) => {
-                let input = encoder.owned(shape, pixels)?;
-                let outputs: Vec<_> =
-                    links.iter().map(|link| (link.output.as_str(), Place::Device)).collect();
-                let found = encoder.run_bound(memory, &[(name, &input)], &outputs)?;
-                found.into_iter().map(Held::Device).collect()
-            }
-            None => {
-                let input = encoder.tensor(shape, &pixels)?;
-                let outputs: Vec<_> =
-                    links.iter().map(|link| (link.output.as_str(), &link.shape[..])).collect();
-                encoder.run_all(vec![(name, input)], &outputs)?.into_iter().map(Held::Host).collect()
-            }
-        };
+        let input = encoder.owned(vec![1, 3, size, size], pixels)?;
+        let outputs: Vec<_> = links.iter().map(|link| (link.output.as_str(), Place::Device)).collect();
+        let found = encoder.run_bound(&self.memory, &[(&self.names.pixels, &input)], &outputs)?;
         let inputs = links.iter().map(|link| link.input.clone());
         Ok(Embedding { tensors: inputs.zip(found).collect(), letterbox: self.letterbox_of(image) })
     }
@@ -205,7 +186,7 @@ impl Sam {
         n_prompts: usize,
         points: &[[f32; 2]],
         labels: &[i64],
-    ) -> Result<Decoded, SessionError> {
+    ) -> Result<Decoded, ModelError> {
         let mut decoder = self.decoder.lock().unwrap_or_else(PoisonError::into_inner);
         let per_call = match self.names.is_one_by_one {
             true => 1,
@@ -215,15 +196,14 @@ impl Sam {
         let mut decoded = Decoded::default();
         let calls = points.chunks(per_call * n_points.max(1)).zip(labels.chunks(per_call * n_points.max(1)));
         for (points, labels) in calls {
-            let missing = self.prompts_per_call.map_or(0, |n| n * n_points - points.len());
-            if missing == 0 {
-                decoded.append(self.decode_call(&mut decoder, embedding, n_points, (points, labels))?);
-                continue;
+            // A decoder for a fixed number of prompts gets the first ones again in place of those that are missing.
+            let n = self.prompts_per_call.map_or(points.len(), |n| n * n_points);
+            let padded: Vec<_> = points.iter().cycle().take(n).copied().collect();
+            let labels: Vec<_> = labels.iter().cycle().take(n).copied().collect();
+            let mut found = self.decode_call(&mut decoder, embedding, n_points, (&padded, &labels))?;
+            if points.len() < n {
+                found.truncate(points.len() / n_points.max(1));
             }
-            let points: Vec<_> = points.iter().chain(points.iter().cycle().take(missing)).copied().collect();
-            let labels: Vec<_> = labels.iter().chain(labels.iter().cycle().take(missing)).copied().collect();
-            let mut found = self.decode_call(&mut decoder, embedding, n_points, (&points, &labels))?;
-            found.truncate(per_call - missing / n_points.max(1));
             decoded.append(found);
         }
         Ok(decoded)
@@ -236,18 +216,31 @@ impl Sam {
         embedding: &Embedding,
         n_points: usize,
         (points, labels): (&[[f32; 2]], &[i64]),
-    ) -> Result<Decoded, SessionError> {
-        let found = self.run_decoder(decoder, embedding, n_points, (points, labels))?;
+    ) -> Result<Decoded, ModelError> {
+        let n = (points.len() / n_points.max(1)) as i64;
+        let n_points = n_points as i64;
+        let (names, n_masks) = (&self.names, MASKS_PER_PROMPT as i64);
+        let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
+        let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
+        outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
+        let points = decoder.owned(vec![1, n, n_points, 2], points.as_flattened().to_vec())?;
+        let labels = decoder.owned(vec![1, n, n_points], labels.to_vec())?;
+        let boxes = decoder.owned::<f32>(vec![1, 0, 4], Vec::new())?;
+        let mut inputs = vec![(names.points.as_str(), &points), (names.labels.as_str(), &labels)];
+        inputs.extend(names.boxes.iter().map(|name| (name.as_str(), &boxes)));
+        inputs.extend(embedding.tensors.iter().map(|(name, tensor)| (name.as_str(), tensor)));
+        let places: Vec<_> = outputs.iter().map(|(name, _)| (*name, Place::Host)).collect();
+        let mut found = decoder.run_bound(&self.memory, &inputs, &places)?.into_iter();
+        let floats = |(name, shape): &(&str, &[i64])| decoder.floats(found.next(), name, shape);
+        let found: Vec<Tensor> = outputs.iter().map(floats).collect::<Result<_, _>>()?;
         let mut found = found.into_iter();
         let mut next = || found.next().unwrap_or_default();
         let (scores, masks, objects) = (next(), next(), next());
         let logits_px = [masks.shape[4] as u32, masks.shape[3] as u32];
         // The upsampling needs 3; SAM's logits are never larger than the square.
         if logits_px.iter().any(|edge| !(3..=self.size_px).contains(edge)) {
-            let expected = format!("masks of 3 to {} px a side", self.size_px);
-            return Err(
-                decoder.layout_error(format!("masks are {} x {} px", logits_px[0], logits_px[1]), expected)
-            );
+            let found = format!("masks are {} x {} px", logits_px[0], logits_px[1]);
+            return Err(decoder.layout_error(&found, &format!("masks of 3 to {} px a side", self.size_px)));
         }
         Ok(Decoded {
             predicted_ious: scores.values.into_vec(),
@@ -255,56 +248,6 @@ impl Sam {
             logits: masks.values,
             logits_px,
         })
-    }
-
-    /// The decoder's scores, masks and, if it has them, object logits.
-    fn run_decoder(
-        &self,
-        decoder: &mut Model,
-        embedding: &Embedding,
-        n_points: usize,
-        (points, labels): (&[[f32; 2]], &[i64]),
-    ) -> Result<Vec<Tensor>, SessionError> {
-        let n = (points.len() / n_points.max(1)) as i64;
-        let n_points = n_points as i64;
-        let names = &self.names;
-        let n_masks = MASKS_PER_PROMPT as i64;
-        let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
-        let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
-        outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
-        let (points_shape, labels_shape) = (vec![1, n, n_points, 2], vec![1, n, n_points]);
-        match &self.memory {
-            Some(memory) => {
-                let points = decoder.owned(points_shape, points.as_flattened().to_vec())?;
-                let labels = decoder.owned(labels_shape, labels.to_vec())?;
-                let boxes = decoder.owned::<f32>(vec![1, 0, 4], Vec::new())?;
-                let mut inputs = vec![(names.points.as_str(), &points), (names.labels.as_str(), &labels)];
-                inputs.extend(names.boxes.iter().map(|name| (name.as_str(), &boxes)));
-                inputs.extend(embedding.tensors.iter().filter_map(|(name, held)| match held {
-                    Held::Device(value) => Some((name.as_str(), value)),
-                    Held::Host(_) => None,
-                }));
-                let places: Vec<_> = outputs.iter().map(|(name, _)| (*name, Place::Host)).collect();
-                let found = decoder.run_bound(memory, &inputs, &places)?;
-                let floats = |(value, (name, shape)): (DynTensor, &(&str, &[i64]))| {
-                    decoder.floats(Some(value), name, shape)
-                };
-                found.into_iter().zip(&outputs).map(floats).collect()
-            }
-            None => {
-                let mut inputs = vec![
-                    (names.points.as_str(), decoder.tensor(points_shape, points.as_flattened())?),
-                    (names.labels.as_str(), decoder.tensor(labels_shape, labels)?),
-                ];
-                if let Some(boxes) = &names.boxes {
-                    inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
-                }
-                for (name, shape, values) in embedding.tensors() {
-                    inputs.push((name, decoder.tensor(shape.to_vec(), values)?));
-                }
-                decoder.run_all(inputs, &outputs)
-            }
-        }
     }
 }
 
@@ -371,10 +314,10 @@ impl Letterbox {
 mod tests {
     use super::*;
 
-    /// Tensors left on the GPU between the two files give the same bits as copies.
+    /// A decoder for two prompts runs twice, the second time padded, and gives the masks of one for any number.
     #[slag_test_support::needs_shared]
     #[test]
-    fn bound_tensors_give_the_same_masks() {
+    fn a_decoder_for_two_prompts_gives_the_same_masks() {
         let options = SessionOptions::new(slag_test_support::onnx_runtime());
         let dir = tempfile::tempdir().expect("a folder");
         for file in ["vision_encoder.onnx", "prompt_encoder_mask_decoder.onnx"] {
@@ -385,7 +328,7 @@ mod tests {
                            image_encoder = { path = 'vision_encoder.onnx' }\n\
                            mask_decoder = { path = 'prompt_encoder_mask_decoder.onnx' }\n";
         fs_err::write(dir.path().join(FILE_NAME), description).expect("writes");
-        let mut sam = Sam::open(dir.path(), &options).expect("opens");
+        let sam = Sam::open(dir.path(), &options).expect("opens");
         let image = RgbImage::from_fn(90, 61, |x, y| image::Rgb([x as u8 * 2, y as u8 * 4, (x * y) as u8]));
         let decoded = |sam: &Sam| {
             let embedding = sam.embed(&image).expect("runs");
@@ -394,19 +337,13 @@ mod tests {
         };
         let plain = decoded(&sam);
         assert!(plain.logits.iter().any(|logit| *logit > 0.0) && plain.predicted_ious.len() == 9);
-        sam.memory = Some(DeviceMemory::of_processor());
-        assert!(decoded(&sam) == plain);
-        // A decoder for two prompts runs twice, the second time padded.
-        let mut sam = Sam::open_for(dir.path(), &options, Some(2)).expect("opens");
+        let sam = Sam::open_for(dir.path(), &options, Some(2)).expect("opens");
         assert_eq!(sam.prompts_per_call, Some(2));
-        for memory in [None, Some(DeviceMemory::of_processor())] {
-            sam.memory = memory;
-            let found = decoded(&sam);
-            assert_eq!(found.logits.len(), plain.logits.len());
-            let pairs = found.logits.iter().zip(&*plain.logits);
-            let others = found.predicted_ious.iter().zip(&plain.predicted_ious);
-            let off = pairs.chain(others).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(off < 1e-4, "{off}");
-        }
+        let found = decoded(&sam);
+        assert_eq!(found.logits.len(), plain.logits.len());
+        let pairs = found.logits.iter().zip(&*plain.logits);
+        let others = found.predicted_ious.iter().zip(&plain.predicted_ious);
+        let off = pairs.chain(others).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(off < 1e-4, "{off}");
     }
 }

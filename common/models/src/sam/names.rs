@@ -2,7 +2,8 @@
 
 use ort::value::TensorElementType::{Float32, Int64};
 
-use crate::session::{Declared, Model, SessionError, declared, listed, shapes_fit};
+use crate::ModelError;
+use crate::session::{Declared, Model, declared, listed, shapes_fit};
 
 /// SAM's masks per prompt: subpart, part and whole, in that order.
 pub const MASKS_PER_PROMPT: usize = 3;
@@ -28,8 +29,6 @@ pub(super) struct Names {
 #[derive(Debug)]
 pub(super) struct Link {
     pub(super) output: String,
-    /// Declared shape of the output; -1 is any size.
-    pub(super) shape: Vec<i64>,
     pub(super) input: String,
 }
 
@@ -50,12 +49,8 @@ impl Inputs {
         for (name, tensor) in declared(decoder.session.inputs()) {
             let given = offered.iter().find(|(output, _)| *output == name);
             match (given, tensor) {
-                (Some((output, Some((Float32, shape)))), Some((Float32, _))) => {
-                    inputs.embeddings.push(Link {
-                        output: output.clone(),
-                        shape: shape.clone(),
-                        input: name,
-                    });
+                (Some((output, Some((Float32, _)))), Some((Float32, _))) => {
+                    inputs.embeddings.push(Link { output: output.clone(), input: name });
                 }
                 (_, Some((Float32, shape))) if matches!(shape[..], [_, _, _, 2]) => {
                     inputs.is_one_by_one = shape[1] == 1;
@@ -67,24 +62,24 @@ impl Inputs {
             }
         }
         // Some exports name a single embedding differently on both sides.
-        if let ([_], [(output, Some((Float32, shape)))], true) =
+        if let ([_], [(output, Some((Float32, _)))], true) =
             (&inputs.others[..], offered, inputs.embeddings.is_empty())
         {
             let input = inputs.others.swap_remove(0);
-            inputs.embeddings.push(Link { output: output.clone(), shape: shape.clone(), input });
+            inputs.embeddings.push(Link { output: output.clone(), input });
         }
         inputs
     }
 }
 
 impl Names {
-    pub(super) fn discover(encoder: &Model, decoder: &Model, size_px: i64) -> Result<Self, SessionError> {
+    pub(super) fn discover(encoder: &Model, decoder: &Model, size_px: i64) -> Result<Self, ModelError> {
         let pixels = match &declared(encoder.session.inputs())[..] {
             [(name, Some((Float32, shape)))] if matches!(shape[..], [_, 3 | -1, _, _]) => name.clone(),
             _ => {
                 let expected = format!("an image encoder's only one, f32 [-1, 3, {size_px}, {size_px}]");
                 let found = format!("its inputs are {}", listed(encoder.session.inputs()).join(", "));
-                return Err(encoder.layout_error(found, expected));
+                return Err(encoder.layout_error(&found, &expected));
             }
         };
         encoder.expect_input(pixels.as_str(), Float32, &[-1, 3, size_px, size_px])?;
@@ -104,10 +99,8 @@ impl Names {
                  f32 [-1, -1, 4] or none, and no others (no earlier masks)",
                 names.join(", ")
             );
-            return Err(decoder.layout_error(
-                format!("its inputs are {}", listed(decoder.session.inputs()).join(", ")),
-                expected,
-            ));
+            let found = format!("its inputs are {}", listed(decoder.session.inputs()).join(", "));
+            return Err(decoder.layout_error(&found, &expected));
         };
         let n_masks = MASKS_PER_PROMPT as i64;
         Ok(Self {
@@ -125,7 +118,7 @@ impl Names {
 }
 
 /// Finds the decoder's f32 output of shape `expected`: the one called `name`, else the first that fits.
-fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, SessionError> {
+fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, ModelError> {
     let outputs = declared(decoder.session.outputs());
     let fits =
         |declared: &&Declared| matches!(&declared.1, Some((Float32, shape)) if shapes_fit(shape, expected));
@@ -135,6 +128,6 @@ fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, Sessi
     let found = named.or_else(by_shape);
     found.map(|(name, _)| name.clone()).ok_or_else(|| {
         let found = format!("its outputs are {}", listed(decoder.session.outputs()).join(", "));
-        decoder.layout_error(found, format!("one of them f32 {expected:?}"))
+        decoder.layout_error(&found, &format!("one of them f32 {expected:?}"))
     })
 }

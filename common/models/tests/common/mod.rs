@@ -6,9 +6,8 @@ pub mod onnx;
 
 use std::path::{Path, PathBuf};
 
-use slag_common::npy::Npz;
 use slag_models::SessionOptions;
-pub use slag_test_support::{needs_shared, shared, workspace_root};
+pub use slag_test_support::{needs_shared, npz_array as array, shared, workspace_root};
 
 pub fn model_dir(name: &str) -> PathBuf {
     workspace_root().join("tests/models").join(name)
@@ -17,15 +16,6 @@ pub fn model_dir(name: &str) -> PathBuf {
 /// Sessions on the ONNX Runtime that `scripts/setup.sh` installs.
 pub fn options() -> SessionOptions {
     SessionOptions::new(slag_test_support::onnx_runtime())
-}
-
-/// An array of an npz file: its shape and elements.
-pub fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<usize>, Vec<T>) {
-    let mut archive = Npz::open(npz).expect("the npz opens");
-    let member = archive.array(name).expect("it is readable").unwrap_or_else(|| panic!("no array {name}"));
-    let array = npyz::NpyFile::new(member).expect("an array");
-    let shape = array.shape().iter().map(|&n| n as usize).collect();
-    (shape, array.into_vec().expect("elements are of that type"))
 }
 
 /// An image `[height][width][3]` of an npz file.

@@ -11,6 +11,10 @@ use slag_models::{ModelDir, SessionOptions};
 
 use server::*;
 
+fn is_told(error: &HubError, parts: [&str; 2]) -> bool {
+    parts.iter().all(|part| error.to_string().contains(part))
+}
+
 #[test]
 fn a_pulled_model_is_checked_described_and_pulled_once() {
     let (server, root, _) = setting();
@@ -86,7 +90,7 @@ fn a_robot_pulls_the_text_side_and_still_knows_the_space() {
     });
     let error =
         hub_of(&table(), &server.url, bare.path()).pull("made", Side::Text, true).expect_err("no name");
-    assert!(matches!(error, HubError::NoImageHash { .. }), "{error}");
+    assert!(error.to_string().contains("no SHA-256 of the image model"), "{error}");
 }
 
 #[test]
@@ -146,7 +150,7 @@ fn downloads_with_another_hash_are_discarded() {
     server.change(|files| files.bytes.get_mut("onnx/text.onnx").expect("it is there").push(0));
     server.asked();
     let error = hub_of(&table, &server.url, root.path()).pull("made", Side::Text, true).expect_err("wrong");
-    assert!(matches!(error, HubError::Advertised { by: Source::Table, .. }), "{error}");
+    assert!(is_told(&error, ["the hub advertises SHA-256", "(known to this program)"]), "{error}");
     assert!(server.asked().iter().all(|asked| asked.method == "HEAD"));
 
     // Lengths: more than the program knows; a body that goes on.
@@ -178,17 +182,16 @@ fn the_lock_keeps_what_was_accepted_first() {
     remove("tokenizer.json");
     server.change(|files| files.bytes.get_mut("tokenizer.json").expect("it is there").push(b' '));
     let error = hub.pull("made", Side::Both, false).expect_err("changed");
-    assert!(matches!(error, HubError::Hash { by: Source::FirstPull, .. }), "{error}");
+    assert!(is_told(&error, ["tokenizer.json: SHA-256 is", "(as pulled first"]), "{error}");
     // Another model, which the hub admits.
     remove("onnx/text.onnx");
     server.change(|files| files.bytes.get_mut("onnx/text.onnx").expect("it is there").push(0));
     let error = hub.pull("made", Side::Both, false).expect_err("changed");
-    assert!(matches!(error, HubError::Advertised { by: Source::Hub, .. }), "{error}");
-    assert!(error.to_string().contains("take the model out of models.lock"), "{error}");
+    assert!(is_told(&error, ["(advertised by the hub)", "take the model out of models.lock"]), "{error}");
     // Another commit.
     server.change(|files| files.commit = "ffffffffffffffffffffffffffffffffffffffff");
     let error = hub.pull("made", Side::Both, false).expect_err("changed");
-    assert!(matches!(error, HubError::Revision { .. }), "{error}");
+    assert!(error.to_string().contains("serves commit ffff"), "{error}");
 
     fs_err::write(root.path().join("models.lock"), "{").expect("it is writable");
     let error = hub.pull("made", Side::Both, false).expect_err("damaged").to_string();

@@ -11,22 +11,10 @@ use crate::splat::error::SplatError;
 use crate::splat::values::{dc_of_colour, unit_rotation, with_largest};
 
 const GAUSSIANS_PER_CHUNK: usize = 256;
-const RANGES: [&str; 12] = [
-    "min_x",
-    "min_y",
-    "min_z",
-    "max_x",
-    "max_y",
-    "max_z",
-    "min_scale_x",
-    "min_scale_y",
-    "min_scale_z",
-    "max_scale_x",
-    "max_scale_y",
-    "max_scale_z",
-];
-const COLOUR_RANGES: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
-const PACKED: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+const RANGES: &str = "min_x min_y min_z max_x max_y max_z min_scale_x min_scale_y min_scale_z max_scale_x max_scale_y \
+                      max_scale_z";
+const COLOUR_RANGES: &str = "min_r min_g min_b max_r max_g max_b";
+const PACKED: &str = "packed_position packed_rotation packed_scale packed_color";
 const EXPORT_AGAIN: &str = "export the compressed PLY again";
 
 /// Ranges of a chunk: minima and maxima of position, log scale and colour.
@@ -62,10 +50,10 @@ fn unpack_rotation(word: u32) -> [f64; 4] {
 
 fn read_chunks(ply: &mut Ply) -> Result<Vec<Chunk>, SplatError> {
     let chunk = ply.require_element("chunk", EXPORT_AGAIN)?;
-    let mut properties = ply.properties(chunk, &RANGES, EXPORT_AGAIN)?;
+    let mut properties = ply.properties(chunk, RANGES, EXPORT_AGAIN)?;
     // Files of the first version have no colour ranges; colours span 0..=1.
-    if ply.elements[chunk].property(COLOUR_RANGES[0]).is_some() {
-        properties.extend(ply.properties(chunk, &COLOUR_RANGES, EXPORT_AGAIN)?);
+    if ply.elements[chunk].property("min_r").is_some() {
+        properties.extend(ply.properties(chunk, COLOUR_RANGES, EXPORT_AGAIN)?);
     }
     ply.seek_element(chunk)?;
     let mut chunks = Vec::with_capacity(ply.checked_count(chunk)?);
@@ -80,17 +68,14 @@ fn read_chunks(ply: &mut Ply) -> Result<Vec<Chunk>, SplatError> {
 
 /// Reads the rows; the header is already read.
 pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
-    let packed = ply.properties(vertex, &PACKED, EXPORT_AGAIN)?;
+    let packed = ply.properties(vertex, PACKED, EXPORT_AGAIN)?;
     let chunks = read_chunks(&mut ply)?;
     ply.seek_element(vertex)?;
     let count = ply.checked_count(vertex)?;
-    if count.div_ceil(GAUSSIANS_PER_CHUNK) != chunks.len() {
-        return Err(SplatError::malformed(
-            ply.input.path(),
-            ply.input.place(),
-            format_args!("{} chunks for {count} Gaussians", count.div_ceil(GAUSSIANS_PER_CHUNK)),
-            chunks.len(),
-        ));
+    let n_chunks = count.div_ceil(GAUSSIANS_PER_CHUNK);
+    if n_chunks != chunks.len() {
+        let expected = format_args!("{n_chunks} chunks for {count} Gaussians");
+        return Err(ply.input.malformed(expected, chunks.len()));
     }
     let sh = match ply.element("sh") {
         Some(sh) if options.with_sh_rest => Some((sh, sh_rest_properties(&ply, sh)?)),
@@ -114,12 +99,7 @@ pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<
         ply.seek_element(sh)?;
         let sh_count = ply.checked_count(sh)?;
         if sh_count != count {
-            return Err(SplatError::malformed(
-                ply.input.path(),
-                ply.input.place(),
-                format_args!("{count} rows of element \"sh\""),
-                sh_count,
-            ));
+            return Err(ply.input.malformed(format_args!("{count} rows of element \"sh\""), sh_count));
         }
         out.sh_degree = degree;
         out.sh_rest.reserve_exact(count * properties.len());
@@ -131,12 +111,10 @@ pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<
 
 /// Returns a coefficient stored as a byte: buckets of 1/32 within +-4; the first and last stand for the ends.
 fn unpack_sh(byte: f64) -> f32 {
-    let unit = if byte <= 0.0 {
-        0.0
-    } else if byte >= 255.0 {
-        1.0
-    } else {
-        (byte + 0.5) / 256.0
+    let unit = match byte {
+        ..=0.0 => 0.0,
+        255.0.. => 1.0,
+        _ => (byte + 0.5) / 256.0,
     };
     ((unit - 0.5) * 8.0) as f32
 }

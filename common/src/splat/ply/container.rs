@@ -3,7 +3,9 @@
 //! Grammar after Turk, "The PLY Polygon File Format" (1994): lines of words up to `end_header`,
 //! then the rows of each element in the order declared.
 
-use crate::splat::error::{Place, SplatError};
+use std::fmt::Display;
+
+use crate::splat::error::SplatError;
 use crate::splat::input::Input;
 
 /// Headers of splats take 1 to 3 kB plus comments.
@@ -112,10 +114,11 @@ impl Element {
 
     /// Returns the length of a binary row, or `None` if the element has lists.
     fn row_bytes(&self) -> Option<usize> {
-        self.properties
-            .iter()
-            .map(|p| if let Kind::Scalar(scalar) = p.kind { Some(scalar.bytes()) } else { None })
-            .sum()
+        let bytes = |property: &Property| match property.kind {
+            Kind::Scalar(scalar) => Some(scalar.bytes()),
+            Kind::List { .. } => None,
+        };
+        self.properties.iter().map(bytes).sum()
     }
 }
 
@@ -139,29 +142,15 @@ impl Ply {
             let text = String::from_utf8_lossy(&bytes);
             let complete = bytes.ends_with(b"\n");
             let step = if complete { header.line(text.trim()) } else { Err("a line of a PLY header") };
-            match step {
-                Ok(false) => {}
-                Ok(true) => {
-                    let Some(encoding) = header.encoding else {
-                        return Err(SplatError::malformed(
-                            input.path(),
-                            Place::Line(line),
-                            "a `format` line before `end_header`",
-                            "none",
-                        ));
-                    };
+            let expected = match (step, header.encoding) {
+                (Ok(false), _) => continue,
+                (Ok(true), Some(encoding)) => {
                     return Ok(Self { input, encoding, elements: header.elements, next: 0, line });
                 }
-                Err(expected) => {
-                    let found: String = text.trim().chars().take(60).collect();
-                    return Err(SplatError::malformed(
-                        input.path(),
-                        Place::Line(line),
-                        expected,
-                        format_args!("{found:?}"),
-                    ));
-                }
-            }
+                (Ok(true), None) => "a `format` line before `end_header`",
+                (Err(expected), _) => expected,
+            };
+            return Err(at_line(&input, line, expected, excerpt(text.trim())));
         }
         unreachable!("the header's lines are bounded by MAX_HEADER_BYTES")
     }
@@ -170,37 +159,25 @@ impl Ply {
         self.elements.iter().position(|e| e.name == name)
     }
 
-    pub fn require_element(&self, name: &str, advice: &'static str) -> Result<usize, SplatError> {
-        let missing = || self.missing(format!("a header with an element {name:?}"), advice);
+    pub fn require_element(&self, name: &str, advice: &str) -> Result<usize, SplatError> {
+        let missing = || self.missing(format_args!("an element {name:?}"), advice);
         self.element(name).ok_or_else(missing)
     }
 
-    /// Returns the indices of properties of an element, all of which must exist.
-    pub fn properties(
-        &self,
-        element: usize,
-        names: &[&str],
-        advice: &'static str,
-    ) -> Result<Vec<usize>, SplatError> {
+    /// Returns the indices of properties of an element, all of which must exist. `names`: separated by spaces.
+    pub fn properties(&self, element: usize, names: &str, advice: &str) -> Result<Vec<usize>, SplatError> {
         let element = &self.elements[element];
-        let index = |name: &&str| {
-            let missing = || {
-                self.missing(format!("a header with property {name:?} of element {:?}", element.name), advice)
-            };
+        let index = |name: &str| {
+            let missing =
+                || self.missing(format_args!("property {name:?} of element {:?}", element.name), advice);
             element.property(name).ok_or_else(missing)
         };
-        names.iter().map(index).collect()
+        names.split(' ').map(index).collect()
     }
 
-    fn missing(&self, expected: String, advice: &'static str) -> SplatError {
-        let place = Place::Line(self.line);
-        SplatError::Malformed {
-            path: self.input.path().into(),
-            place,
-            expected,
-            found: "none".into(),
-            advice,
-        }
+    fn missing(&self, what: impl Display, advice: &str) -> SplatError {
+        let fault = format_args!("expected a header with {what}, found none; {advice}");
+        SplatError::at(self.input.path(), format_args!("line {}", self.line), fault)
     }
 
     /// Returns the number of rows of the next element, checked to fit into the rest of the file.
@@ -211,35 +188,30 @@ impl Ply {
             (Encoding::Ascii, Some(_)) => 2 * element.properties.len(),
             (_, Some(bytes)) => bytes,
             (_, None) => {
-                return Err(SplatError::Unsupported {
-                    path: self.input.path().into(),
-                    format: format!("a list property in element {:?}", element.name),
-                    advice: "export the splat without this property",
-                });
+                let format = format_args!("a list property in element {:?}", element.name);
+                let advice = "export the splat without this property";
+                return Err(SplatError::unsupported(self.input.path(), format, advice));
             }
         } as u64;
         let available = self.input.remaining_bytes() + u64::from(self.encoding == Encoding::Ascii);
         match element.count.checked_mul(row_bytes) {
             Some(bytes) if bytes <= available && row_bytes > 0 => Ok(element.count as usize),
             Some(0) => Ok(0),
-            _ => Err(SplatError::malformed(
-                self.input.path(),
-                self.input.place(),
-                format_args!("{} rows of {row_bytes} bytes or more ({:?})", element.count, element.name),
-                format_args!("{} bytes up to the end of the file", self.input.remaining_bytes()),
-            )),
+            _ => {
+                let (n, name) = (element.count, &element.name);
+                let left = self.input.remaining_bytes();
+                let expected = format_args!("{n} rows of {row_bytes} bytes or more ({name:?})");
+                Err(self.input.malformed(expected, format_args!("{left} bytes up to the end of the file")))
+            }
         }
     }
 
     /// Positions the file at the rows of `element`, which must not have been passed.
     pub fn seek_element(&mut self, element: usize) -> Result<(), SplatError> {
         if element < self.next {
-            return Err(SplatError::malformed(
-                self.input.path(),
-                Place::Line(self.line),
-                format_args!("element {:?} later in the file", self.elements[element].name),
-                "it before an element that it must follow",
-            ));
+            let expected = format_args!("element {:?} later in the file", self.elements[element].name);
+            let found = "it before an element that it must follow";
+            return Err(at_line(&self.input, self.line, expected, found));
         }
         while self.next < element {
             self.skip_element()?;
@@ -258,12 +230,8 @@ impl Ply {
             for _ in 0..element.count {
                 read_ascii_row(&mut self.input, &mut self.line, &mut line, &mut all)?;
                 if all.len() != element.properties.len() {
-                    return Err(SplatError::malformed(
-                        self.input.path(),
-                        Place::Line(self.line),
-                        format_args!("{} numbers", element.properties.len()),
-                        all.len(),
-                    ));
+                    let expected = format_args!("{} numbers", element.properties.len());
+                    return Err(at_line(&self.input, self.line, expected, all.len()));
                 }
                 for (value, &index) in values.iter_mut().zip(wanted) {
                     *value = all[index];
@@ -354,30 +322,23 @@ fn read_ascii_row(
     while values.is_empty() {
         input.read_line(line, u64::MAX)?;
         if line.is_empty() {
-            return Err(SplatError::malformed(
-                input.path(),
-                Place::Line(*line_number),
-                "another row after this line",
-                "the end of the file",
-            ));
+            return Err(at_line(input, *line_number, "another row after this line", "the end of the file"));
         }
         *line_number += 1;
         for word in line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()) {
-            match number(word) {
-                Some(value) => values.push(value),
-                None => {
-                    let found: String = String::from_utf8_lossy(word).chars().take(60).collect();
-                    return Err(SplatError::malformed(
-                        input.path(),
-                        Place::Line(*line_number),
-                        "a number",
-                        format_args!("{found:?}"),
-                    ));
-                }
-            }
+            let found = || excerpt(&String::from_utf8_lossy(word));
+            values.push(number(word).ok_or_else(|| at_line(input, *line_number, "a number", found()))?);
         }
     }
     Ok(())
+}
+
+fn at_line(input: &Input, line: u64, expected: impl Display, found: impl Display) -> SplatError {
+    SplatError::malformed(input.path(), format_args!("line {line}"), expected, found)
+}
+
+fn excerpt(text: &str) -> String {
+    format!("{:?}", text.chars().take(60).collect::<String>())
 }
 
 /// C libraries of Windows write NaN as `-nan(ind)` or `1.#QNAN`.

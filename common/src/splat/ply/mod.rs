@@ -28,7 +28,7 @@ use sh_rest::sh_rest_properties;
 const NOT_A_SPLAT: &str =
     "this is not a trained splat but perhaps a point cloud or mesh: give the PLY of the splat";
 const VERTEX: &str = "vertex";
-const GEOMETRY: [&str; 9] = ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0"];
+const GEOMETRY: &str = "x y z rot_0 rot_1 rot_2 rot_3 opacity scale_0";
 /// Colours of 0 to 1 are not brighter, even where harmonics overshoot.
 const BRIGHTEST: f32 = 16.0;
 /// Balls lack the second and third scale.
@@ -47,7 +47,7 @@ pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, Spla
 
 /// Reads the rows of an uncompressed PLY.
 fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
-    let mut wanted = ply.properties(vertex, &GEOMETRY, NOT_A_SPLAT)?;
+    let mut wanted = ply.properties(vertex, GEOMETRY, NOT_A_SPLAT)?;
     let [second_scale, third_scale] =
         [SECOND_SCALE, THIRD_SCALE].map(|name| ply.elements[vertex].property(name));
     // A ball has one scale for all axes; a flat Gaussian's third scale is read from another property and set to 0.
@@ -55,7 +55,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
     if is_ball {
         wanted.extend([wanted[8]; 2]);
     } else {
-        wanted.extend(ply.properties(vertex, &[SECOND_SCALE], NOT_A_SPLAT)?);
+        wanted.extend(ply.properties(vertex, SECOND_SCALE, NOT_A_SPLAT)?);
         wanted.push(third_scale.unwrap_or(wanted[9]));
     }
     let rgb_names = ["red", "green", "blue"];
@@ -64,7 +64,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
     let colours = rgb.filter(|_| ply.elements[vertex].property("f_dc_0").is_none());
     match &colours {
         Some(rgb) => wanted.extend(rgb),
-        None => wanted.extend(ply.properties(vertex, &["f_dc_0", "f_dc_1", "f_dc_2"], NOT_A_SPLAT)?),
+        None => wanted.extend(ply.properties(vertex, "f_dc_0 f_dc_1 f_dc_2", NOT_A_SPLAT)?),
     }
     let (degree, rest) = sh_rest_properties(&ply, vertex)?;
     let degree = options.kept_degree(degree);
@@ -105,7 +105,7 @@ pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Ve
     const NO_VERTICES: &str = "give a PLY with this property";
     let mut ply = Ply::open(Input::open(path)?)?;
     let vertex = ply.require_element(VERTEX, NO_VERTICES)?;
-    let wanted = ply.properties(vertex, &names, NO_VERTICES)?;
+    let wanted = ply.properties(vertex, &names.join(" "), NO_VERTICES)?;
     ply.seek_element(vertex)?;
     let mut rows = Vec::with_capacity(ply.checked_count(vertex)?);
     ply.rows(&wanted, |row| rows.push(std::array::from_fn(|i| row[i])))?;

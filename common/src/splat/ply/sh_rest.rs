@@ -3,7 +3,7 @@
 use super::container::Ply;
 use crate::Gaussians;
 use crate::splat::columns::MAX_SH_DEGREE;
-use crate::splat::error::{Place, SplatError};
+use crate::splat::error::SplatError;
 
 /// A degree that some trainers write; it is truncated to [`MAX_SH_DEGREE`].
 const HIGHER_SH_DEGREE: u8 = MAX_SH_DEGREE + 1;
@@ -16,13 +16,9 @@ pub(super) fn sh_rest_properties(ply: &Ply, element: usize) -> Result<(u8, Vec<u
     let per_channel = in_file.len() / 3;
     let of_degree = |degree: &u8| 3 * Gaussians::sh_rest_per_channel(*degree) == in_file.len();
     let Some(degree) = (0..=HIGHER_SH_DEGREE).find(of_degree) else {
-        return Err(SplatError::Malformed {
-            path: ply.input.path().into(),
-            place: Place::Byte(0),
-            expected: "0, 9, 24, 45 or 72 properties f_rest_*".into(),
-            found: in_file.len().to_string(),
-            advice: "export with spherical harmonics of degree 0 to 3",
-        });
+        let fault = format!("expected 0, 9, 24, 45 or 72 properties f_rest_*, found {}", in_file.len());
+        let advice = "export with spherical harmonics of degree 0 to 3";
+        return Err(SplatError::at(ply.input.path(), "header", format_args!("{fault}; {advice}")));
     };
     let degree = degree.min(MAX_SH_DEGREE);
     let kept = 0..Gaussians::sh_rest_per_channel(degree);

@@ -10,7 +10,6 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::str::FromStr;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -24,7 +23,7 @@ use slag_encoder::progress::Progress;
 
 use super::field;
 use super::query::{TextArgs, TextReport, time_texts};
-use crate::harness::{Machine, load_1min};
+use crate::harness::Machine;
 use crate::programs::{fetch_all, json_of, remove, sibling};
 use crate::table::Table;
 
@@ -42,15 +41,14 @@ pub(crate) struct RobotArgs {
     /// Numbers of results.
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [1_000, 10_000, 50_000, 100_000], value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
     limits: Vec<u64>,
-    /// What to time: profiles of slag-edge, and engines of slag-bench-rivals. NAME=GAUSSIANS leaves an engine out
-    /// at larger sizes: a graph of millions takes hours to build.
+    /// What to time: profiles of slag-edge, and engines of slag-bench-rivals. A graph of millions takes hours to build.
     #[arg(
         long,
-        value_name = "NAME[=MOST],...",
+        value_name = "NAME,...",
         value_delimiter = ',',
         default_value = "compact,balanced,dense,qdrant-scan,qdrant-scan-int8,qdrant-hnsw,qdrant-hnsw-int8,qdrant-hnsw-pq"
     )]
-    engines: Vec<Engine>,
+    engines: Vec<String>,
     /// Timed queries of each number of results.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
     runs: u32,
@@ -61,56 +59,23 @@ pub(crate) struct RobotArgs {
     models: ModelArgs,
 }
 
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Engine {
-    /// A profile of `slag-edge`, or an engine of `edge/benches/rivals`.
-    name: String,
-    most_gaussians: Option<u64>,
+/// The profile whose shards `slag-edge` queries; `None` for engines of `edge/benches/rivals`.
+fn profile_of(engine: &str) -> Option<Profile> {
+    Profile::ALL.into_iter().find(|profile| profile.name() == engine)
 }
 
-impl FromStr for Engine {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let (name, most) = text.split_once('=').map_or((text, None), |(name, most)| (name, Some(most)));
-        let is_name = !name.is_empty()
-            && name.chars().all(|c| c.is_ascii_lowercase() || c == '-' || c.is_ascii_digit());
-        match most.map(str::parse).transpose() {
-            Ok(most_gaussians) if is_name => Ok(Self { name: name.to_owned(), most_gaussians }),
-            _ => Err(format!("{text:?} is not NAME or NAME=GAUSSIANS, like qdrant-hnsw=1000000")),
-        }
-    }
-}
-
-impl Engine {
-    /// The profile whose shards `slag-edge` queries; `None` for other engines.
-    fn profile(&self) -> Option<Profile> {
-        Profile::ALL.into_iter().find(|profile| profile.name() == self.name)
-    }
-
-    /// Returns the memory that measuring a size takes, in bytes, or a little more. Other engines hold all vectors
-    /// in f32; qdrant-edge holds them twice while it moves them into immutable segments.
-    fn memory_bytes(&self, n_gaussians: u64, dim: u32) -> u64 {
-        let vectors = n_gaussians * u64::from(dim) * 4;
-        match self.name.as_str() {
-            _ if self.profile().is_some() => n_gaussians * 100,
-            name if name.starts_with("qdrant") => vectors * 23 / 10,
-            _ => vectors * 12 / 10,
-        }
-    }
-
-    /// The reason not to measure it at a size, if there is one.
-    fn reason_against(&self, args: &RobotArgs, free: Option<u64>, n_gaussians: u64) -> Option<String> {
-        if let Some(most) = self.most_gaussians.filter(|most| n_gaussians > *most) {
-            return Some(format!("asked for up to {most} Gaussians"));
-        }
-        if self.profile().is_none() && args.rivals.is_none() {
-            return Some("no --rivals program is given".into());
-        }
-        let (needed, free) = (self.memory_bytes(n_gaussians, args.dim), free?);
-        let gb = |bytes: u64| bytes as f64 / 1e9;
-        (needed > free).then(|| format!("needs {:.1} GB of memory, {:.1} are free", gb(needed), gb(free)))
-    }
+/// The reason not to measure an engine at a size, if there is one; `free`: bytes of memory. Other engines hold all
+/// vectors in f32; qdrant-edge holds them twice while it moves them into immutable segments.
+fn reason_against(engine: &str, args: &RobotArgs, free: Option<u64>, n_gaussians: u64) -> Option<String> {
+    let vectors = n_gaussians * u64::from(args.dim) * 4;
+    let needed = match profile_of(engine) {
+        None if args.rivals.is_none() => return Some("no --rivals program is given".into()),
+        None if engine.starts_with("qdrant") => vectors * 23 / 10,
+        None => vectors * 12 / 10,
+        Some(_) => n_gaussians * 100,
+    };
+    let (free, gb) = (free?, |bytes: u64| bytes as f64 / 1e9);
+    (needed > free).then(|| format!("needs {:.1} GB of memory, {:.1} are free", gb(needed), gb(free)))
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -122,8 +87,6 @@ struct Figures {
     build_secs: Option<f64>,
     disk_bytes: Option<u64>,
     rss_bytes: Option<u64>,
-    /// Load average of the last minute before it was measured: above its threads, others shared the machine.
-    load_1min: Option<f64>,
     searches: Vec<SearchFigures>,
 }
 
@@ -169,12 +132,12 @@ pub(crate) fn run(args: &RobotArgs, progress: &dyn Progress) -> Result<RobotRepo
     for size in &args.gaussians {
         let mut scene = Scene::new(args, *size);
         for engine in &args.engines {
-            let path = args.out.join(format!("figures/{}-{size}-{}.json", engine.name, args.dim));
+            let path = args.out.join(format!("figures/{engine}-{size}-{}.json", args.dim));
             if path.is_file() {
                 let malformed = || format!("{}: delete the file to measure again", path.display());
                 report.figures.push(serde_json::from_slice(&fs_err::read(&path)?).with_context(malformed)?);
-            } else if let Some(reason) = engine.reason_against(args, free, *size) {
-                report.not_run.push(format!("{} at {} M: {reason}", engine.name, *size as f64 / 1e6));
+            } else if let Some(reason) = reason_against(engine, args, free, *size) {
+                report.not_run.push(format!("{engine} at {} M: {reason}", *size as f64 / 1e6));
             } else {
                 let figures = scene.measure(engine, progress)?;
                 slag_common::durable::write(&path, &serde_json::to_vec_pretty(&figures)?)?;
@@ -210,7 +173,8 @@ impl<'a> Scene<'a> {
             return Ok(());
         }
         remove(dir)?;
-        let mut profiles: Vec<Profile> = args.engines.iter().filter_map(Engine::profile).collect();
+        let mut profiles: Vec<Profile> =
+            args.engines.iter().filter_map(|engine| profile_of(engine)).collect();
         let has_exact = profiles.contains(&Profile::Exact);
         if args.rivals.is_some() && !has_exact {
             profiles.push(Profile::Exact);
@@ -239,13 +203,13 @@ impl<'a> Scene<'a> {
         Ok(cache)
     }
 
-    fn measure(&mut self, engine: &Engine, progress: &dyn Progress) -> Result<Figures> {
+    fn measure(&mut self, engine: &str, progress: &dyn Progress) -> Result<Figures> {
         self.publish(progress)?;
-        progress.begin(&engine.name, "engine", 1, 0);
+        progress.begin(engine, "engine", 1, 0);
         let (ids, dump) = (self.dir.join("ids"), self.dir.join("dump"));
         fs_err::create_dir_all(&ids)?;
         let limits = self.args.limits.iter().map(u64::to_string).collect::<Vec<_>>().join(",");
-        let mut command = match (engine.profile(), &self.args.rivals) {
+        let mut command = match (profile_of(engine), &self.args.rivals) {
             (Some(profile), _) => {
                 let mut command = Command::new(sibling("slag-lab")?);
                 command.args(["--json", "bench", "query", "--precision", "measured"]);
@@ -257,24 +221,22 @@ impl<'a> Scene<'a> {
             }
             (None, Some(rivals)) => {
                 let mut command = Command::new(rivals);
-                command.args(["--engine", &engine.name]).arg("--dump").arg(&dump);
+                command.args(["--engine", engine]).arg("--dump").arg(&dump);
                 command
             }
-            (None, None) => bail!("{}: no --rivals program is given", engine.name),
+            (None, None) => bail!("{engine}: no --rivals program is given"),
         };
         command.args(["--limits", &limits, "--runs", &self.args.runs.to_string()]).arg("--ids").arg(&ids);
-        let load_1min = load_1min();
         let printed = json_of(&mut command)?;
         let searches = printed["searches"].as_array().into_iter().flatten();
         let figures = Figures {
-            engine: engine.name.clone(),
+            engine: engine.to_owned(),
             library: printed["library"].as_str().unwrap_or("slag-edge").to_owned(),
             n_gaussians: self.n_gaussians,
             build_secs: printed["build_secs"].as_f64(),
             disk_bytes: printed["disk_bytes"].as_u64().or_else(|| printed["shard_bytes"].as_u64()),
             rss_bytes: printed["rss_bytes"].as_u64(),
-            load_1min,
-            searches: searches.map(|of| self.search(of, &engine.name, &ids)).collect::<Result<_>>()?,
+            searches: searches.map(|of| self.search(of, engine, &ids)).collect::<Result<_>>()?,
         };
         remove(&ids)?;
         progress.end();
@@ -325,10 +287,6 @@ impl fmt::Display for RobotReport {
             "`slag-lab bench robot`, {} components; from a text's vector to ids and scores.",
             self.dim
         )?;
-        let loads = self.figures.iter().filter_map(|f| f.load_1min);
-        if let Some(most) = loads.reduce(f64::max) {
-            writeln!(f, "Load average before an engine: at most {most:.1}, this run's own work included.")?;
-        }
         for (model, (text, times)) in self.text.iter().flat_map(|t| t.texts.iter().map(|of| (&t.model, of))) {
             writeln!(f, "Text to vector adds {:.2} ms ({model}, {text:?}).", times.median_ms)?;
         }
@@ -433,33 +391,18 @@ mod tests {
         args: RobotArgs,
     }
 
-    #[test]
-    fn engines_have_names_and_most_gaussians() {
-        let read = |text: &str| text.parse::<Engine>();
-        let graph = read("qdrant-hnsw=1000000").expect("well-formed");
-        assert_eq!(
-            (graph.name.as_str(), graph.most_gaussians, graph.profile()),
-            ("qdrant-hnsw", Some(1_000_000), None)
-        );
-        assert!(read("balanced").expect("well-formed").profile().is_some());
-        for wrong in ["", "=1", "a=", "a=b", "a b", "../a"] {
-            assert!(read(wrong).is_err(), "{wrong:?}");
-        }
-    }
-
     /// A second run measures nothing again; an engine without its program or memory is named.
     #[test]
     fn what_cannot_run_is_named() {
         let dir = tempfile::tempdir().expect("a folder");
         let out = dir.path().to_str().expect("UTF-8");
         let line = ["x", "--out", out, "--gaussians", "1000,2000", "--limits", "10", "--dim", "16"];
-        let line = line.into_iter().chain(["--engines", "dense,qdrant-scan=1000", "--models", "colours"]);
+        let line = line.into_iter().chain(["--engines", "dense", "--models", "colours"]);
         let args = Line::parse_from(line).args;
-        let dense = &args.engines[0];
         let few = RobotArgs { rivals: Some(PathBuf::new()), ..Line::parse_from(["x", "--out", out]).args };
-        assert!(dense.reason_against(&few, Some(10), 1000).is_some_and(|reason| reason.contains("needs")));
+        assert!(reason_against("dense", &few, Some(10), 1000).is_some_and(|reason| reason.contains("needs")));
         let kept = r#"{"engine":"dense","library":"l","n_gaussians":1000,"build_secs":61.0,"disk_bytes":52000000,
-            "rss_bytes":null,"load_1min":1.5,"searches":[{"limit":10,"min_ms":0.5,"median_ms":12.3,"p99_ms":20,"recall":0.9}]}"#;
+            "rss_bytes":null,"searches":[{"limit":10,"min_ms":0.5,"median_ms":12.3,"p99_ms":20,"recall":0.9}]}"#;
         fs_err::create_dir_all(dir.path().join("figures")).expect("makes");
         fs_err::write(dir.path().join("figures/dense-1000-16.json"), kept).expect("writes");
         let report = run(&args, &slag_encoder::progress::Silent).expect("runs");
@@ -469,7 +412,6 @@ mod tests {
         for line in [
             "| dense (l) | 0.001 | 12.30 (0.50, 0.900) | - | 0.05 | 61 |",
             "- not run: dense at 0.002 M: no --rivals program is given",
-            "- not run: qdrant-scan at 0.002 M: asked for up to 1000 Gaussians",
             "| 100,000 | 0.52 | 0.74 | 1.36 | 2.37 |",
         ] {
             assert!(lines.iter().any(|found| found == line), "{line}\n{page}");

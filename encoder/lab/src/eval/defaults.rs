@@ -10,7 +10,7 @@ use slag_encoder::encode::Preset;
 use slag_encoder::progress::Progress;
 
 use super::instances::InstanceReport;
-use super::judge::{EvalKind, JudgeSettings, judge};
+use super::judge::{EvalKind, EvalReport, JudgeSettings, judge};
 use super::run::{MaskSource, Runner, ScenesArgs, truth_of};
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure, percent};
@@ -23,15 +23,10 @@ struct Row {
     scene: String,
     masks: MaskSource,
     method: &'static str,
-    kind: EvalKind,
-    miou: Option<f64>,
-    average_precision: Option<f64>,
-    area_under_roc: Option<f64>,
-    /// Absent categories that found nothing, of all.
-    abstained: [usize; 2],
-    instances: Option<InstanceReport>,
     n_masks: u64,
     encode_secs: f64,
+    #[serde(flatten)]
+    report: EvalReport,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -61,24 +56,15 @@ pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<Defaults
             for kind in &[EvalKind::Gaussians, EvalKind::Objects][..1 + usize::from(is_default)] {
                 let settings = JudgeSettings { kind: Some(*kind), ..JudgeSettings::default() };
                 let report = judge(&encoded.reader, &truth, &mut *text, &settings)?;
-                let average_precision = report.mean_average_precision;
-                tracing::info!(
-                    "{} {} {method}, by {kind}: AP {average_precision:.4?}",
-                    files.name,
-                    source.name()
-                );
+                let (source_name, ap) = (source.name(), report.mean_average_precision);
+                tracing::info!("{} {source_name} {method}, by {kind}: AP {ap:.4?}", files.name);
                 rows.push(Row {
                     scene: files.name.clone(),
                     masks: source,
                     method,
-                    kind: *kind,
-                    miou: report.multi_class.first().and_then(|all| all.miou),
-                    average_precision,
-                    area_under_roc: report.mean_area_under_roc,
-                    abstained: report.abstained,
-                    instances: report.instances,
                     n_masks: encoded.summary.n_masks as u64,
                     encode_secs: encoded.secs,
+                    report,
                 });
             }
         }
@@ -99,9 +85,11 @@ impl fmt::Display for DefaultsReport {
         let mut table = Table::new(columns.into_iter().chain(of_things));
         for row in &self.rows {
             let mut cells = vec![row.scene.clone(), row.masks.name().to_owned()];
-            cells.extend([row.method.to_owned(), row.kind.to_string()]);
-            cells.extend([row.miou, row.average_precision, row.area_under_roc].map(figure));
-            if let Some(found) = &row.instances {
+            let report = &row.report;
+            cells.extend([row.method.to_owned(), report.kind.to_string()]);
+            cells
+                .extend([report.miou, report.mean_average_precision, report.mean_area_under_roc].map(figure));
+            if let Some(found) = &report.instances {
                 let InstanceReport { any, n_merged_objects, n_objects, n_in_objects, n_split_things, .. } =
                     found;
                 cells.push(any.to_string());

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::Serialize;
+use slag_encoder::query::PublishedObjects;
 
 use super::truth::Truth;
 use crate::table::percent;
@@ -48,24 +49,15 @@ pub(crate) struct InstanceReport {
     pub(crate) n_split_things: usize,
     /// Recall by any object, whatever its word: the quality of the segmentation alone.
     pub(crate) any: Recall,
-    /// Recall by objects that reach the threshold for the thing's word.
-    pub(crate) of_words: Recall,
-    /// Recall by the word's n best objects, where n is the number of things with that word.
-    pub(crate) best_of_words: Recall,
 }
 
 impl fmt::Display for InstanceReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { n_objects, n_in_objects, n_merged_objects, n_split_things, any, of_words, best_of_words } =
-            self;
+        let Self { n_objects, n_in_objects, n_merged_objects, n_split_things, any } = self;
         let share = percent(n_in_objects[0] as u64, n_in_objects[1] as u64);
         writeln!(
             f,
-            "{n_objects} objects of {share} of all Gaussians; things found at IoU 0.25 and 0.5, by any object: {any}"
-        )?;
-        writeln!(
-            f,
-            "  by objects above the threshold for the word: {of_words}; by the word's best objects: {best_of_words}"
+            "{n_objects} objects of {share} of all Gaussians; things found at IoU 0.25 and 0.5: {any}"
         )?;
         writeln!(
             f,
@@ -74,16 +66,12 @@ impl fmt::Display for InstanceReport {
     }
 }
 
-/// `object_of`: the object of each Gaussian; `classes`: words with the ids of their things; `scores`: by word and
-/// object.
-pub(super) fn report(
-    truth: &Truth,
-    object_of: &[u32],
-    n_objects: usize,
-    classes: &[(String, Vec<u16>)],
-    scores: &[Vec<f32>],
-    threshold: f32,
-) -> InstanceReport {
+pub(super) fn report(truth: &Truth, objects: &PublishedObjects) -> InstanceReport {
+    of_objects(truth, &objects.object_of, objects.ids.len())
+}
+
+/// `object_of`: the object of each Gaussian.
+fn of_objects(truth: &Truth, object_of: &[u32], n_objects: usize) -> InstanceReport {
     let mut n_of_object = vec![0u64; n_objects];
     let mut n_of_thing: BTreeMap<u16, u64> = BTreeMap::new();
     let mut n_of_both: BTreeMap<(u16, u32), u64> = BTreeMap::new();
@@ -94,9 +82,8 @@ pub(super) fn report(
             *n_of_both.entry((*thing, *object)).or_default() += 1;
         }
     }
-    let best_iou = |thing: u16, counts: &dyn Fn(u32) -> bool| {
-        let of_thing =
-            n_of_both.range((thing, 0)..=(thing, u32::MAX)).filter(|((_, object), _)| counts(*object));
+    let best_iou = |thing: u16| {
+        let of_thing = n_of_both.range((thing, 0)..=(thing, u32::MAX));
         let iou = |((_, object), both): (&(u16, u32), &u64)| {
             *both as f64 / (n_of_object[*object as usize] + n_of_thing[&thing] - both) as f64
         };
@@ -112,22 +99,12 @@ pub(super) fn report(
     let is_split = |id: &u16| n_objects_of_thing.get(id).is_some_and(|n| *n > 1);
     let n_split_things = truth.things.iter().filter(|thing| is_split(&thing.id)).count();
     let n_merged_objects = n_labels_of_object.iter().filter(|n| **n > 1).count();
-    let [mut any, mut of_words, mut best_of_words] = [Recall::default(); 3];
+    let mut any = Recall::default();
     // Things without Gaussians cannot be found.
     let things = truth.things.iter().map(|thing| thing.id).filter(|id| n_of_thing.contains_key(id));
-    things.for_each(|thing| any.count(best_iou(thing, &|_| true)));
-    for ((_, ids), scores) in classes.iter().zip(scores) {
-        let ids: Vec<u16> = ids.iter().copied().filter(|id| n_of_thing.contains_key(id)).collect();
-        let mut order: Vec<u32> = (0..n_objects as u32).collect();
-        order.sort_by(|a, b| scores[*b as usize].total_cmp(&scores[*a as usize]).then(a.cmp(b)));
-        order.truncate(ids.len());
-        for thing in ids {
-            of_words.count(best_iou(thing, &|object| scores[object as usize] >= threshold));
-            best_of_words.count(best_iou(thing, &|object| order.contains(&object)));
-        }
-    }
+    things.for_each(|thing| any.count(best_iou(thing)));
     let n_in_objects = [object_of.iter().filter(|object| **object != NONE).count(), object_of.len()];
-    InstanceReport { n_objects, n_in_objects, n_merged_objects, n_split_things, any, of_words, best_of_words }
+    InstanceReport { n_objects, n_in_objects, n_merged_objects, n_split_things, any }
 }
 
 #[cfg(test)]
@@ -145,23 +122,11 @@ mod tests {
             background: vec![thing(1, "wall")],
             id_of_gaussian: vec![7, 7, 7, 7, 8, 8, 8, 8, 1, 1],
         };
-        let object_of = [0, 0, 0, NONE, 1, 2, 2, NONE, 2, 2];
-        let classes = [("chair".to_owned(), vec![7, 8]), ("table".to_owned(), vec![9])];
-        // IoU: 3/4; 1/4 with object 1, 2/6 with object 2.
-        let found = |chair: Vec<f32>| report(&truth, &object_of, 3, &classes, &[chair, vec![0.9; 3]], 0.5);
-        // Object 2 is half thing and half wall; thing 8 is a quarter of object 1 and half of object 2.
-        let whole = found(vec![0.0; 3]);
-        assert_eq!((whole.n_objects, whole.n_merged_objects, whole.n_split_things), (3, 1, 1));
-        assert_eq!(whole.n_in_objects, [8, 10]);
-        let recall = |n, n_at_25, n_at_50| Recall { n, n_at_25, n_at_50 };
-        let report = found(vec![0.9, 0.6, 0.1]);
-        assert_eq!(
-            (report.any, report.of_words, report.best_of_words),
-            (recall(2, 2, 1), recall(2, 2, 1), recall(2, 2, 1))
-        );
-        let report = found(vec![0.4, 0.1, 0.8]);
-        assert_eq!((report.of_words, report.best_of_words), (recall(2, 1, 0), recall(2, 2, 1)));
-        let report = found(vec![0.1, 0.45, 0.48]);
-        assert_eq!((report.of_words, report.best_of_words), (recall(2, 0, 0), recall(2, 1, 0)));
+        // IoU: 3/4; 1/4 with object 1, 2/6 with object 2. Object 2 is half thing and half wall; thing 8 is a quarter
+        // of object 1 and half of object 2.
+        let found = of_objects(&truth, &[0, 0, 0, NONE, 1, 2, 2, NONE, 2, 2], 3);
+        assert_eq!((found.n_objects, found.n_merged_objects, found.n_split_things), (3, 1, 1));
+        assert_eq!(found.n_in_objects, [8, 10]);
+        assert_eq!(found.any, Recall { n: 2, n_at_25: 2, n_at_50: 1 });
     }
 }

@@ -26,7 +26,7 @@ pub(crate) fn remove(dir: &Path) -> std::io::Result<()> {
     if dir.exists() { fs_err::remove_dir_all(dir) } else { Ok(()) }
 }
 
-pub(crate) fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
+fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
     let name = value.to_possible_value().map(|value| value.get_name().to_owned());
     name.ok_or_else(|| anyhow!("{value:?} has no name"))
 }

@@ -5,13 +5,11 @@ mod langsplat;
 mod levels;
 mod sam2;
 
-use std::path::Path;
-
 use slag_common::View;
 use slag_math::random::Random;
 use slag_models::SessionOptions;
 use slag_models::sam::{Decoded, Letterbox};
-use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
+use slag_test_support::{needs_shared, npz_array as array, onnx_runtime, shared, workspace_root};
 
 use super::filter::Filters;
 use super::runs::{Run, RunMask};
@@ -460,13 +458,6 @@ fn tiny(settings: SamSettings) -> SamSegmenter {
         .expect("it opens")
 }
 
-fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
-    let mut archive = slag_common::npy::Npz::open(npz).expect("an npz");
-    let member = archive.array(name).expect("readable").expect("there");
-    let array = npyz::NpyFile::new(member).expect("an array");
-    (array.shape().to_vec(), array.into_vec().expect("of that type"))
-}
-
 /// Recorded results of `SamImageProcessor.post_process_masks`.
 #[needs_shared]
 #[test]
@@ -483,7 +474,7 @@ fn enlarged_masks_equal_the_recorded_ones() {
     let (shape, recorded) = array::<u8>(&golden, "masks_original_size");
     let upsampler = Upsampler::new(&embedding.letterbox, decoded.logits_px);
     let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
-    let (width, stride) = (photo.width() as usize, shape[3] as usize);
+    let (width, stride) = (photo.width() as usize, shape[3]);
     let (mut n_inside, mut n_differing) = (0, 0);
     for (k, logits) in decoded.logits.chunks_exact(n_logits).enumerate() {
         let mask = upsampler.cut(logits, 0.0, [0, 0]).map(|cut| cut.mask.to_mask(0));

@@ -102,7 +102,7 @@ fn measure_group<'p>(
 fn file_name(scene: &SceneFiles, point: &Point, programs: &Programs) -> String {
     let dir = scene.dir.canonicalize().unwrap_or_else(|_| scene.dir.clone());
     // The first word is the version of the figures: files of another one are not read.
-    let key = format!("5 {dir:?} {point:?} {}", programs.made_by);
+    let key = format!("6 {dir:?} {point:?} {}", programs.made_by);
     format!("{}-{}.json", scene.name, &blake3::hash(key.as_bytes()).to_hex()[..16])
 }
 
@@ -136,20 +136,14 @@ impl Run<'_> {
         let of_views = *views_seconds.get_or_insert(own_views);
         let judged = self.evaluate()?;
         let n_gaussians = figure(&encoded, "n_gaussians")?.max(1.0);
-        let all = &judged["multi_class"][0];
         Ok(Ok(Figures {
             scene: self.scene.name.clone(),
             point: point.clone(),
             made_by: programs.made_by.clone(),
-            n_views: integer(&encoded, "n_views"),
             n_photos: integer(&encoded, "n_views_with_photo"),
             n_gaussians: n_gaussians as u64,
-            n_masks: integer(&encoded, "n_masks"),
-            miou: figure(all, "miou")?,
-            macc: figure(all, "macc")?,
+            miou: figure(&judged, "miou")?,
             map: judged["mean_average_precision"].as_f64(),
-            auc: judged["mean_area_under_roc"].as_f64(),
-            n_unknown_words: judged["unknown_words"].as_object().map_or(0, |words| words.len() as u64),
             seconds: figure(&encoded, "wall_secs")? - own_views + of_views,
             views_seconds: of_views,
             coverage_seconds: figure(&encoded, "coverage_secs")?,

@@ -18,17 +18,11 @@ pub(super) struct Figures {
     pub(super) point: Point,
     /// Models, device and version; figures of others are not comparable.
     pub(super) made_by: String,
-    pub(super) n_views: u64,
     /// Views of the scene with a photo, before any were chosen.
     pub(super) n_photos: u64,
     pub(super) n_gaussians: u64,
-    pub(super) n_masks: u64,
     pub(super) miou: f64,
-    pub(super) macc: f64,
     pub(super) map: Option<f64>,
-    pub(super) auc: Option<f64>,
-    /// Words that the encoder does not know; no mean counts them.
-    pub(super) n_unknown_words: u64,
     /// Seconds of the encode; those for the views; those for choosing the views.
     pub(super) seconds: f64,
     pub(super) views_seconds: f64,
@@ -119,10 +113,7 @@ impl TradeoffReport {
 impl fmt::Display for TradeoffReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "Pareto-optimal in mIoU and seconds (s), bytes (b) of its scene.\n")?;
-        let columns = [
-            "scene", "", "axis", "point", "seconds", "views", "masks", "mIoU", "mAcc", "AP", "AUC", "bytes/G",
-        ];
-        let mut table = Table::new(columns);
+        let mut table = Table::new(["scene", "", "axis", "point", "seconds", "mIoU", "AP", "bytes/G"]);
         for scene in self.scenes() {
             let of_scene: Vec<&Figures> = self.figures.iter().filter(|f| f.scene == scene).collect();
             let fronts = COSTS
@@ -135,21 +126,13 @@ impl fmt::Display for TradeoffReport {
                     p.point.axis.clone(),
                     p.point.name.clone(),
                     format!("{:.1}", p.seconds),
-                    p.n_views.to_string(),
-                    p.n_masks.to_string(),
                     figure(Some(p.miou)),
-                    figure(Some(p.macc)),
                     figure(p.map),
-                    figure(p.auc),
                     format!("{:.2}", p.bytes_per_gaussian),
                 ]);
             }
         }
         write!(f, "{table}")?;
-        self.left_out.iter().try_for_each(|point| writeln!(f, "- not run: {point}"))?;
-        match self.figures.iter().map(|f| f.n_unknown_words).max() {
-            Some(n @ 1..) => writeln!(f, "{n} words are unknown to the encoder and left out of the means"),
-            _ => Ok(()),
-        }
+        self.left_out.iter().try_for_each(|point| writeln!(f, "- not run: {point}"))
     }
 }

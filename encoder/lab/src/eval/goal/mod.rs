@@ -1,10 +1,10 @@
-//! `eval goal`: places to stand, judged on generated scenes by their true surfaces: the voxels that are called
-//! free, and the poses that the robot's program gives for each thing.
+//! `eval goal`: places to stand, judged on generated scenes by their true surfaces: the poses that the robot's program
+//! gives for each thing.
 
 mod road;
 mod truth;
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -16,7 +16,6 @@ use road::Road;
 use serde::Serialize;
 use serde_json::Value;
 use slag_common::objects::public_id;
-use slag_common::occupancy::BLOCK_EDGE;
 use slag_encoder::objects::NONE;
 use slag_encoder::progress::Progress;
 use slag_encoder::query::PublishedObjects;
@@ -93,7 +92,6 @@ fn judge(
     service: &Service,
     report: &mut Places,
 ) -> Result<()> {
-    report.voxels.add(compare_voxels(layout, &dir.join("store"))?);
     let labels = labels(&dir.join("scene"), &dir.join("store"))?;
     let start = truth.start;
     for index in (0..layout.placed.len()).filter(|index| !layout.placed[*index].shell) {
@@ -194,7 +192,6 @@ pub(crate) struct GoalReport {
 
 #[derive(Clone, Debug, Default, Serialize)]
 struct Places {
-    voxels: Voxels,
     /// Things that the robot truly reaches: places within reach from which they are shown.
     n_reachable: usize,
     /// Those with a pose from which the true surfaces show them.
@@ -260,9 +257,6 @@ impl fmt::Display for GoalReport {
 
 impl Places {
     fn tell(&self, row: &mut impl FnMut(&str, String, String)) {
-        let Voxels { n_free, n_false, len_bytes } = self.voxels;
-        row("free voxels", n_free.to_string(), format!("{n_false} false: {}", percent(n_false, n_free)));
-        row("bytes of occupancy in each profile", len_bytes.to_string(), String::new());
         let share = percent(self.n_shown as u64, self.n_reachable as u64);
         let shown = format!("{} with a pose that shows them: {share}", self.n_shown);
         row("reachable things", self.n_reachable.to_string(), shown);
@@ -279,78 +273,6 @@ impl Places {
         let millis = format!("{:.1} ms median, {:.1} ms at most", times.median_ms, times.max_ms);
         row("requests", times.n.to_string(), millis);
     }
-}
-
-/// Spacing of the tested surface points.
-const SPACING_M: f64 = 0.012;
-
-#[derive(Clone, Copy, Debug, Default, Serialize)]
-struct Voxels {
-    n_free: u64,
-    /// Those with a true surface inside, or inside a solid.
-    n_false: u64,
-    len_bytes: u64,
-}
-
-impl Voxels {
-    fn add(&mut self, other: Self) {
-        self.n_free += other.n_free;
-        self.n_false += other.n_false;
-        self.len_bytes += other.len_bytes;
-    }
-}
-
-fn compare_voxels(layout: &Layout, store: &Path) -> Result<Voxels> {
-    let reader = StoreReader::open(store)?;
-    let mut found = Voxels::default();
-    let mut surfaces: Option<HashSet<[i32; 3]>> = None;
-    for cell in &reader.manifest().cells {
-        let Some(record) = cell.shards.values().next() else { continue };
-        let shard = reader.read_shard(record)?;
-        let Some(occupancy) = shard.layout.additions(&shard.bytes).occupancy else { continue };
-        let voxel = occupancy.header.voxel;
-        let surfaces = surfaces.get_or_insert_with(|| surface_voxels(layout, voxel));
-        found.len_bytes += occupancy.sections().iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
-        for run in occupancy.runs() {
-            for block in run.blocks.clone() {
-                let [_, free] = run.masks_of(block);
-                let at = occupancy.block_at(block);
-                for bit in (0..64).filter(|bit| free >> bit & 1 == 1) {
-                    let offset = [bit / 16, bit / 4 % 4, bit % 4];
-                    let place = [0, 1, 2].map(|axis| at[axis] * BLOCK_EDGE + offset[axis]);
-                    let centre = (DVec3::from(place.map(f64::from)) + 0.5) * voxel;
-                    found.n_free += 1;
-                    found.n_false += u64::from(surfaces.contains(&place) || is_solid(layout, centre));
-                }
-            }
-        }
-    }
-    Ok(found)
-}
-
-fn surface_voxels(layout: &Layout, voxel: f64) -> HashSet<[i32; 3]> {
-    let mut voxels = HashSet::new();
-    for placed in &layout.placed {
-        for part in &placed.object.parts {
-            for surfel in part.surfels(SPACING_M) {
-                let at = placed.world_from_object.transform_point3(surfel.position) / voxel;
-                voxels.insert(at.floor().to_array().map(|v| v as i32));
-            }
-        }
-    }
-    voxels
-}
-
-fn is_solid(layout: &Layout, point: DVec3) -> bool {
-    // A ceiling's box encloses its whole room, but only the surface is a thing.
-    let things = layout.placed.iter().filter(|placed| !placed.shell);
-    let near = things.filter(|placed| placed.bounds.contains(point));
-    near.flat_map(|placed| placed.object.parts.iter().map(move |part| (placed, part))).any(
-        |(placed, part)| {
-            let world_from_part = placed.world_from_object * part.object_from_part;
-            part.shape.contains(world_from_part.inverse().transform_point3(point))
-        },
-    )
 }
 
 #[cfg(test)]

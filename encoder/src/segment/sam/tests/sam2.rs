@@ -86,7 +86,7 @@ fn masks_are_enlarged_in_one_step() {
         let mask = upsampler.cut(logits, 0.0, [0, 0]).map(|cut| cut.mask.to_mask(0));
         for y in 0..shape[1] {
             for x in 0..shape[2] {
-                let logit = expected[((k as u64 * shape[1] + y) * shape[2] + x) as usize];
+                let logit = expected[(k * shape[1] + y) * shape[2] + x];
                 let found = mask.as_ref().is_some_and(|mask| mask.contains(3 * x as u32, 3 * y as u32));
                 assert!(found == (logit > 0.0) || logit.abs() < 1e-4, "mask {k} at {x} {y}: {logit}");
                 n_inside += u32::from(found);
