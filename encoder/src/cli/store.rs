@@ -177,7 +177,7 @@ impl fmt::Display for Listed {
         if let (Some(first), n @ 3..) = (self.history.first(), self.history.len()) {
             writeln!(f, "{n} generations since generation {}", first.generation)?;
         }
-        if let Some(JobStatus { n_views, is_published, step }) = &self.job {
+        if let Some(JobStatus { n_views, is_published, step, .. }) = &self.job {
             let step = step.as_deref().unwrap_or("begin");
             match is_published {
                 true => writeln!(f, "contributions of {n_views} views are kept")?,

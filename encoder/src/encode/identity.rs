@@ -1,5 +1,7 @@
 //! What makes two views' contributions the same, so that an encode may go on from those of an earlier one.
 
+use std::collections::BTreeMap;
+
 use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::{Gaussians, Hash32, Intrinsics, View};
@@ -18,14 +20,6 @@ const REGIONS_VERSION: u32 = 4;
 /// Stands for a fleet's rasterisers, which differ between machines.
 #[cfg(feature = "fleet")]
 pub(crate) const OF_A_FLEET: &str = "fleet";
-
-pub(super) struct Identities {
-    /// Hash of everything that the contributions of all views depend on.
-    pub(super) of_scene: Hash32,
-    /// `[n_views]`: hash of everything that a view's contributions depend on, in the order of the views. It includes
-    /// `of_scene`, but no other view, so photos can be added and withdrawn.
-    pub(super) of_view: Vec<Hash32>,
-}
 
 /// Everything on which the contributions of all views depend: files by their content, settings as they are.
 ///
@@ -68,18 +62,19 @@ struct ViewIdentity<'a> {
     camera_from_world: glam::DAffine3,
 }
 
+/// Identities of the scene and, by name, of its views. A view's includes the scene's, but no other view, so photos can
+/// be added and withdrawn.
 pub(super) fn identities(
     settings: &EncodeSettings,
     engines: &Engines<'_>,
     segmenter: &dyn Segmenter,
     rasterizer: &str,
     inputs: &Inputs,
-) -> Result<Identities, EncodeError> {
-    let scene = hash_scene(&inputs.scene);
+) -> Result<(Hash32, BTreeMap<String, Hash32>), EncodeError> {
     let cells = inputs.split.deciding(settings.cells.limits);
-    let of_scene = hash_of(&scene_identity(&settings.view, cells, engines, segmenter, rasterizer, scene))?;
-    let of_view = inputs.views.par_iter().map(|view| of_view(of_scene, view, segmenter));
-    Ok(Identities { of_scene, of_view: of_view.collect::<Result<_, _>>()? })
+    let of_scene = of_scene(&settings.view, cells, engines, segmenter, rasterizer, &inputs.scene)?;
+    let of_view = |view: &View| Ok((view.name.clone(), of_view(of_scene, view, segmenter)?));
+    Ok((of_scene, inputs.views.par_iter().map(of_view).collect::<Result<_, EncodeError>>()?))
 }
 
 /// Hash of everything that a view's contributions depend on, from its files as they are now.
@@ -98,28 +93,17 @@ pub(super) fn of_view(
     })
 }
 
-/// Hash of everything that all views' contributions depend on, in a fleet.
-#[cfg(feature = "fleet")]
+/// Hash of everything that all views' contributions depend on.
 pub(crate) fn of_scene(
     settings: &ViewSettings,
     cells: CellsIdentity,
     engines: &Engines<'_>,
     segmenter: &dyn Segmenter,
+    rasterizer: &str,
     scene: &Gaussians,
 ) -> Result<Hash32, EncodeError> {
-    hash_of(&scene_identity(settings, cells, engines, segmenter, OF_A_FLEET, hash_scene(scene)))
-}
-
-fn scene_identity<'a>(
-    settings: &'a ViewSettings,
-    cells: CellsIdentity,
-    engines: &Engines<'a>,
-    segmenter: &dyn Segmenter,
-    rasterizer: &'a str,
-    scene: Hash32,
-) -> SceneIdentity<'a> {
     let Engines { models, session, .. } = engines;
-    SceneIdentity {
+    hash_of(&SceneIdentity {
         program: env!("CARGO_PKG_VERSION"),
         regions: (REGIONS_VERSION, MAX_RASTER_WIDTH_PX),
         encoder: Hash32(models.encoder_id().hash()),
@@ -130,10 +114,10 @@ fn scene_identity<'a>(
         },
         segmenter: segmenter.identity(),
         rasterizer,
-        scene,
+        scene: hash_scene(scene),
         settings,
         cells,
-    }
+    })
 }
 
 fn hash_of(identity: &impl Serialize) -> Result<Hash32, EncodeError> {
@@ -191,7 +175,7 @@ mod tests {
         change(&mut settings, &mut session);
         let models = ModelDir::colours();
         let engines = Engines::new(&models, &session, &CpuRasterizer);
-        identities(&settings, &engines, segmenter, "cpu", &inputs(photo)).expect("readable").of_view[0]
+        identities(&settings, &engines, segmenter, "cpu", &inputs(photo)).expect("readable").1["a.png"]
     }
 
     /// Views of two devices, or of a fleet, must not mix in one store.
@@ -202,7 +186,7 @@ mod tests {
         let engines = Engines::new(&models, &session, &CpuRasterizer);
         let of = |device: &str| {
             let (graph, inputs) = (GraphSegmenter::default(), inputs(Path::new("absent.png")));
-            identities(&settings, &engines, &graph, device, &inputs).expect("readable").of_scene
+            identities(&settings, &engines, &graph, device, &inputs).expect("readable").0
         };
         assert!(of("cpu") != of("NVIDIA H100 F64") && of("cpu") != of(OF_A_FLEET) && of("cpu") == of("cpu"));
     }

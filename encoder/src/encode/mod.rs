@@ -1,19 +1,16 @@
 //! The pipeline: photos, poses and a splat in, a published generation of shards out.
 //!
-//! Views are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet. They are independent: a
+//! Views are done by an `Executor` (`executor.rs`): this machine, or a fleet. They are independent: a
 //! killed encode resumes after the last finished view, if it is the same encode (`identity.rs`). Later steps read
 //! contributions in the order of the views' names, so the store's bytes do not depend on threads, on the order of views
 //! or on interruptions.
 
-mod cell;
 mod cells;
 mod context;
 pub mod coverage;
-mod drawings;
 mod error;
 mod executor;
 pub mod front;
-mod here;
 mod identity;
 mod inputs;
 mod job;
@@ -23,7 +20,6 @@ mod preset;
 mod publish;
 mod report;
 mod settings;
-mod sink;
 mod view;
 mod views;
 
@@ -53,13 +49,11 @@ pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, Restart,
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet_parts {
     pub(crate) use super::context::RunContext;
-    pub(crate) use super::executor::{Executor, ViewsRun};
-    pub(crate) use super::here::work_off;
+    pub(crate) use super::executor::{Executor, ViewsRun, work_off};
     pub(crate) use super::identity::{OF_A_FLEET, of_scene};
     pub(crate) use super::plan::{Plan, segmenter_of};
     pub(crate) use super::report::LeftOut;
-    pub(crate) use super::sink::{PhotoSource, ViewRecord, ViewSink};
-    pub(crate) use super::view::{ViewStages, ViewTools};
+    pub(crate) use super::view::{PhotoSource, ViewRecord, ViewSink, ViewStages, ViewTools};
 }
 
 /// Encodes a scene into a store and publishes it as the next generation.
@@ -72,7 +66,7 @@ pub fn encode(
     progress: &dyn Progress,
     cancel: &AtomicBool,
 ) -> Result<EncodeSummary, EncodeError> {
-    encode_by(&here::Here, settings, engines, progress, cancel)
+    encode_by(&executor::Here, settings, engines, progress, cancel)
 }
 
 /// Like [`encode`]; `executor` does the views.
@@ -109,7 +103,7 @@ fn encode_into(
     let store = Store::create_or_open(&settings.output.store)?;
     store.check_keys()?;
     if let Some(planned) = &settings.inputs.planned {
-        drawings::make(settings, planned, engines, context)?;
+        inputs::make(settings, planned, engines, context)?;
     }
     let inputs = inputs::Inputs::read(settings, context)?;
     context.begin_phase(Phase::Plan);

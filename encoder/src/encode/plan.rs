@@ -83,19 +83,18 @@ pub(super) fn plan<'a>(
     if let Some(without) = segmenter.check_views(&inputs.views, settings.run.strict)? {
         tracing::warn!("{without}");
     }
-    let ids = context.time("identity", || {
+    let (of_scene, id_of_view) = context.time("identity", || {
         let of = || identity::identities(settings, engines, segmenter.as_ref(), rasterizer, inputs);
         context.install(of)
     })?;
-    let id_of_view = inputs.views.iter().map(|view| view.name.clone()).zip(ids.of_view).collect();
-    let lost_views = lost_views(store, ids.of_scene)?;
-    let job = Job::open(store, ids.of_scene, id_of_view, settings.run.restart)?;
+    let lost_views = lost_views(store, of_scene)?;
+    let job = Job::open(store, of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
     let start = Instant::now();
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
-    let mut plan = Plan {
+    let plan = Plan {
         settings,
         engines,
         inputs,
@@ -110,18 +109,10 @@ pub(super) fn plan<'a>(
         coverage,
         coverage_secs,
     };
-    plan.reserve_views()?;
-    Ok(plan)
-}
-
-impl Plan<'_> {
-    fn reserve_views(&mut self) -> Result<(), EncodeError> {
-        let mut memory = self.memory.clone();
-        self.view_tools().reserve(&mut memory, &self.inputs.views);
-        memory.rest(0)?;
-        self.memory = memory;
-        Ok(())
-    }
+    let mut memory = plan.memory.clone();
+    plan.view_tools().reserve(&mut memory, &inputs.views);
+    memory.rest(0)?;
+    Ok(Plan { memory, ..plan })
 }
 
 /// Encoder of the store's generation, if this encode publishes another's vectors: robots refuse them until they have
@@ -151,11 +142,9 @@ fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<St
 
 /// Finds and reports kept views that cannot be reused; an unfinished encode is refused later, not replaced.
 fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, EncodeError> {
-    let kept = job_status(store.db())?.filter(|status| status.n_views > 0 && status.is_published);
+    let is_lost = |kept: &JobStatus| kept.n_views > 0 && kept.is_published && kept.of_scene != of_scene.0;
+    let kept = job_status(store.db())?.filter(is_lost);
     let Some(JobStatus { n_views, .. }) = kept else { return Ok(None) };
-    if Job::is_kept(store, of_scene)? {
-        return Ok(None);
-    }
     let reason = format!(
         "splat, models, device or settings of views are others than those of the {n_views} kept views, so no view is taken \
          over: what a Gaussian contributes to a photo depends on all those before it"

@@ -74,7 +74,7 @@ fn tidy_up(plan: Plan<'_>, has_open: bool, encoder: Hash32) -> Result<(), Encode
     plan.store.remember_models(&ModelsRecord { encoder, models })?;
     match plan.settings.run.keep_views || has_open {
         true => plan.job.keep_published()?,
-        false => plan.job.finish()?,
+        false => plan.job.clear()?,
     }
     plan.store.prune()?;
     Ok(())

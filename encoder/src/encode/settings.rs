@@ -236,30 +236,24 @@ pub enum ViewOrder {
     Nth,
 }
 
-impl InputSettings {
-    fn new(scene: PathBuf, views: PathBuf, metric: bool) -> Self {
-        Self {
-            scene,
-            views,
-            planned: None,
-            images: None,
-            added: Vec::new(),
-            dropped: Vec::new(),
-            every: None,
-            splat_frame: FrameChoice::Auto,
-            activated: Activated::default(),
-            metric,
-            geo: None,
-        }
-    }
-}
-
 impl EncodeSettings {
     /// Returns the settings to encode a splat and its photos into a store: those of the program without flags, and
     /// of [`Preset::Balanced`](super::Preset::Balanced).
     pub fn new(scene: PathBuf, views: PathBuf, store: PathBuf, metric: bool) -> Self {
         Self {
-            inputs: InputSettings::new(scene, views, metric),
+            inputs: InputSettings {
+                scene,
+                views,
+                planned: None,
+                images: None,
+                added: Vec::new(),
+                dropped: Vec::new(),
+                every: None,
+                splat_frame: FrameChoice::Auto,
+                activated: Activated::default(),
+                metric,
+                geo: None,
+            },
             view: ViewSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
                 min_mask_px: 200,

@@ -14,7 +14,7 @@ use super::executor::{Executor, ViewsRun};
 use super::inputs::Inputs;
 use super::plan::Plan;
 use super::report::{SkippedView, StageReport};
-use super::sink::{ViewRecord, ViewSink};
+use super::view::{ViewRecord, ViewSink};
 use crate::landmarks;
 use crate::memory::Phase;
 use crate::occupancy::{self, OccupancyError, SceneOccupancy};

@@ -11,7 +11,7 @@ use super::documents::{self, FailedView};
 use super::error::FleetError;
 use super::heartbeat::Heartbeat;
 use super::inputs;
-use super::objects::ViewObject;
+use super::objects;
 use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
@@ -122,10 +122,11 @@ impl ViewsInWork<'_> {
     fn fetch_view(&self, plan: &Plan<'_>, id: Hash32, name: &str) -> Result<(), FleetError> {
         let key = documents::view_key(id);
         let bytes = self.bucket.require(&key)?;
-        let view = ViewObject::read(&bytes).map_err(|e| FleetError::damaged(self.bucket, &key, e))?;
-        durable::write(&plan.job.outlines_path(name), view.outlines())?;
-        durable::write(&plan.job.contributions_path(name), view.contributions())?;
-        Ok(plan.job.mark_done(name, view.record)?)
+        let (record, outlines, contributions) =
+            objects::unpack_view(&bytes).map_err(|e| FleetError::damaged(self.bucket, &key, e))?;
+        durable::write(&plan.job.outlines_path(name), &outlines)?;
+        durable::write(&plan.job.contributions_path(name), &contributions)?;
+        Ok(plan.job.mark_done(name, record)?)
     }
 
     /// Leaves out views that workers could not do; with `is_strict`, fails at the first.

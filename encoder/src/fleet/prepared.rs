@@ -1,20 +1,20 @@
-//! A run on a worker: the scene and settings, brought from the bucket and checked.
+//! A run on a worker: the scene and settings, brought from the bucket and checked, and the views' files.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
 use slag_common::{Gaussians, View};
 
-use super::documents::{self, RunPlan};
+use super::documents::{self, PlannedView, RunPlan};
 use super::error::FleetError;
-use super::inputs::{ViewFiles, engines_text, fetch_file, fetch_input};
+use super::inputs::{engines_text, fetch_file, fetch_input};
 use super::objects;
 use super::run::Run;
 use crate::blobs::Bucket;
 use crate::cells::{self, CellSplit};
-use crate::encode::fleet_parts::{RunContext, ViewTools, of_scene};
-use crate::encode::{EncodeError, Engines, Masks, ViewSettings};
+use crate::encode::fleet_parts::{OF_A_FLEET, RunContext, ViewTools, of_scene};
+use crate::encode::{Engines, Masks, ViewSettings};
 use crate::ground::{self, Standing};
 use crate::memory::{MemoryPlan, Phase};
 use crate::raster;
@@ -30,13 +30,14 @@ pub(super) struct Prepared {
     /// By index in the plan.
     pub(super) views: Vec<View>,
     pub(super) number_of: HashMap<String, usize>,
-    pub(super) files: ViewFiles,
+    /// Folder of photos and masks.
+    folder: PathBuf,
 }
 
 impl Prepared {
     /// Fetches scene and masks to `folder`. `segmenter`: this machine's mask model.
     pub(super) fn fetch(
-        bucket: &Arc<Bucket>,
+        bucket: &Bucket,
         (run, plan): (Run, RunPlan),
         folder: &Path,
         segmenter: Option<&PathBuf>,
@@ -47,7 +48,6 @@ impl Prepared {
         let scene = objects::unpack_scene(&bytes).map_err(|e| FleetError::damaged(bucket, &key, e))?;
         drop(bytes);
         let split = context.install(|| cells::split(&scene, plan.limits));
-        let files = ViewFiles::new(Arc::clone(bucket), folder, plan.views.clone());
         let mut settings = plan.settings.clone();
         match (&mut settings.masks, &plan.data_set) {
             (Masks::Given { dir, .. }, Some(data_set)) => {
@@ -55,7 +55,7 @@ impl Prepared {
                 fetch_file(bucket, data_set, dir)?;
             }
             (Masks::Given { dir, .. }, None) => {
-                *dir = files.mask_folder();
+                *dir = folder.join("masks");
                 fs_err::create_dir_all(&dir)?;
             }
             (Masks::Sam { dir, .. }, _) => match segmenter {
@@ -67,12 +67,34 @@ impl Prepared {
             },
             (Masks::Auto { .. } | Masks::Graph, _) => {}
         }
-        let views = files.views()?;
+        let views =
+            plan.views.iter().map(|view| planned_view(view, folder)).collect::<Result<Vec<_>, _>>()?;
         let standing = Arc::new(context.install(|| Standing::find(&scene, &views)));
         let number_of = views.iter().enumerate().map(|(i, view)| (view.name.clone(), i)).collect();
-        Ok(Self { run, plan, settings, scene, split, standing, views, number_of, files })
+        let folder = folder.to_owned();
+        Ok(Self { run, plan, settings, scene, split, standing, views, number_of, folder })
     }
 
+    /// Fetches a view's photo and masks.
+    pub(super) fn fetch_view(&self, bucket: &Bucket, number: usize) -> Result<(), FleetError> {
+        let planned = &self.plan.views[number];
+        let mut files = vec![(&planned.photo, photo_path(planned, &self.folder))];
+        files.extend(planned.masks.as_ref().zip(mask_path(planned, &self.folder)));
+        for (file, path) in files {
+            if !path.is_file() {
+                fetch_file(bucket, file, &path)?;
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn remove_view(&self, number: usize) {
+        let planned = &self.plan.views[number];
+        for path in mask_path(planned, &self.folder).into_iter().chain([photo_path(planned, &self.folder)]) {
+            // It may never have been fetched, and the folder goes with the worker anyway.
+            let _ = std::fs::remove_file(path);
+        }
+    }
     /// Fails if the contributions would differ from the coordinator's.
     pub(super) fn check(
         &self,
@@ -81,8 +103,9 @@ impl Prepared {
         context: &RunContext<'_>,
     ) -> Result<(), FleetError> {
         let cells = self.split.deciding(self.plan.limits);
-        let found = context.install(|| of_scene(&self.settings, cells, engines, segmenter, &self.scene));
-        match found.map_err(FleetError::from)? == self.plan.of_scene {
+        let found =
+            context.install(|| of_scene(&self.settings, cells, engines, segmenter, OF_A_FLEET, &self.scene));
+        match found? == self.plan.of_scene {
             true => Ok(()),
             false => Err(FleetError::Identity {
                 run: self.run.0,
@@ -104,12 +127,23 @@ impl Prepared {
     }
 }
 
-pub(super) fn of_encode(error: EncodeError) -> FleetError {
-    match error {
-        EncodeError::Fleet(inner) => match inner.downcast::<FleetError>() {
-            Ok(error) => *error,
-            Err(inner) => FleetError::Encode(EncodeError::Fleet(inner)),
-        },
-        error => FleetError::Encode(error),
+fn photo_path(view: &PlannedView, folder: &Path) -> PathBuf {
+    folder.join("photos").join(format!("{}.{}", view.id, view.photo.ending))
+}
+
+fn mask_path(view: &PlannedView, folder: &Path) -> Option<PathBuf> {
+    Some(folder.join("masks").join(format!("{}.{}", view.name, view.masks.as_ref()?.ending)))
+}
+
+/// The view as it is on this machine.
+fn planned_view(planned: &PlannedView, folder: &Path) -> Result<View, FleetError> {
+    let PlannedView { name, intrinsics, camera_from_world, .. } = planned;
+    let is_inside = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
+    let mut files = planned.masks.iter().chain([&planned.photo]);
+    if !is_inside || files.any(|file| file.ending.contains(['/', '\\'])) {
+        let reason = "its name leads out of the folder of photos".into();
+        return Err(FleetError::View { view: name.clone(), reason });
     }
+    let (name, image_path) = (name.clone(), photo_path(planned, folder));
+    Ok(View { name, image_path, intrinsics: *intrinsics, camera_from_world: *camera_from_world })
 }

@@ -8,7 +8,7 @@ use super::dispatch::Dispatcher;
 use super::documents::{self, FailedView};
 use super::error::FleetError;
 use super::objects;
-use super::prepared::{Prepared, of_encode};
+use super::prepared::Prepared;
 use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{
     PhotoSource, RunContext, ViewRecord, ViewSink, ViewStages, ViewTools, work_off,
@@ -55,25 +55,25 @@ impl ViewWork<'_> {
         let stages = ViewStages::new(self.tools(), context);
         let source = views_to_do(self.dispatcher, &prepared.views, || context.is_cancelled());
         let source = source.map(|view| (true, view));
-        let reports = work_off(&stages, self.n_threads, source, context, |view, error| {
+        work_off(&stages, self.n_threads, source, context, |view, error| {
             // The coordinator warns of the first few.
             tracing::info!("view {} fails: {error}", view.name);
             Ok(self.fail(view, &error.to_string())?)
-        });
-        reports.map(drop).map_err(of_encode)
+        })?;
+        Ok(())
     }
 
     fn fail(&self, view: &View, reason: &str) -> Result<(), FleetError> {
         let number = self.prepared.number_of[&view.name];
         let document = documents::to_bytes(&FailedView { reason: reason.to_owned() })?;
         self.bucket.put_new(&self.prepared.run.failed_key(number), document)?;
-        self.finish(view);
+        self.finish(number);
         Ok(())
     }
 
-    fn finish(&self, view: &View) {
-        self.prepared.files.remove(view);
-        self.dispatcher.done(self.prepared.number_of[&view.name]);
+    fn finish(&self, number: usize) {
+        self.prepared.remove_view(number);
+        self.dispatcher.done(number);
     }
 }
 
@@ -90,7 +90,7 @@ impl PhotoSource for ViewWork<'_> {
             self.dispatcher.done(number);
             return Ok(false);
         }
-        self.prepared.files.fetch(view)?;
+        self.prepared.fetch_view(self.bucket, number)?;
         Ok(true)
     }
 }
@@ -109,12 +109,13 @@ impl ViewSink for ViewWork<'_> {
     ) -> Result<(), EncodeError> {
         let contributions = contributions.to_bytes(&view.image_path)?;
         let bytes = objects::pack_view(record, &outlines_to_bytes(outlines)?, &contributions)?;
-        let id = self.prepared.plan.views[self.prepared.number_of[&view.name]].id;
+        let number = self.prepared.number_of[&view.name];
+        let id = self.prepared.plan.views[number].id;
         // If another worker was first, its object has the same content.
         if self.bucket.put_new(&documents::view_key(id), bytes)? {
             self.n_done.fetch_add(1, Ordering::Relaxed);
         }
-        self.finish(view);
+        self.finish(number);
         Ok(())
     }
 }
