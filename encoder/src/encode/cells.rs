@@ -12,16 +12,14 @@ use slag_common::landmarks::BuiltLandmarks;
 use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::Profile;
-use slag_common::{Gaussians, Hash32, View};
+use slag_common::{Hash32, View};
 
-use super::context::RunContext;
 use super::error::EncodeError;
 use super::inputs;
 use super::plan::Plan;
 use super::report::ViewsReport;
 use super::view::{ViewRecord, ViewSink};
 use super::views::DoneViews;
-use crate::cells::CellSplit;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::ingest;
 use crate::lanes::Lanes;
@@ -35,8 +33,8 @@ use crate::lift::{
 use crate::memory::Phase;
 use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
-use crate::shard::{self, BuiltShard, CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
-use crate::store::{Extras, Store};
+use crate::shard::{self, BuiltShard, CellEmbeddings, CellExtras, ShardBuilder};
+use crate::store::Extras;
 
 pub(super) struct BuiltCells {
     pub(super) records: Vec<CellRecord>,
@@ -84,10 +82,9 @@ pub(super) fn build_cells(
     views: &DoneViews<'_>,
     occupancy: Option<SceneOccupancy>,
     landmarks: Option<Vec<BuiltLandmarks>>,
-    context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
-    let Plan { inputs, store, settings, .. } = *plan;
-    let opened = context.install(|| Opened::of(plan, views, occupancy.as_ref(), context))?;
+    let Plan { inputs, settings, .. } = *plan;
+    let opened = plan.context.install(|| Opened::of(plan, views, occupancy.as_ref()))?;
     let Opened { index, table, score_context, photos, pass_bytes, cells: budget } = opened;
     let scene = SceneContributions {
         index: &index,
@@ -96,7 +93,7 @@ pub(super) fn build_cells(
         standing: &inputs.standing,
         photos: &photos,
         group_bytes: pass_bytes,
-        cancel: context.cancel,
+        cancel: plan.context.cancel,
     };
     // Before refinement adds superpoints as regions.
     let counts = Counts {
@@ -106,21 +103,18 @@ pub(super) fn build_cells(
         n_entries: index.n_entries(),
         views: views_report(views, &index),
     };
-    let (table, refinement, mut objects) = refine(plan, &scene, table, &score_context, context)?;
+    let (table, refinement, mut objects) = refine(plan, &scene, table, &score_context)?;
     if let Some(found) = &mut objects
         && settings.cells.shards.have_appearance()
     {
-        found.thumbnails = thumbnails(plan, &found.objects, views, context)?;
+        found.thumbnails = thumbnails(plan, &found.objects, views)?;
     }
-    let extras = put_extras(plan, &table, context)?;
-    context.begin_phase(Phase::Cells);
-    context.progress.begin("cells", "cell", inputs.split.cells.len() as u64, 0);
+    let extras = put_extras(plan, &table)?;
+    plan.context.begin_phase(Phase::Cells);
+    plan.context.progress.begin("cells", "cell", inputs.split.cells.len() as u64, 0);
     let has_poses = settings.cells.photo_poses;
     let maker = CellMaker {
-        scene: &inputs.scene,
-        split: &inputs.split,
-        settings: &settings.cells.shards,
-        encoder_id: Hash32(plan.engines.models.encoder_id().hash()),
+        plan,
         table,
         refinement,
         objects,
@@ -128,11 +122,9 @@ pub(super) fn build_cells(
         score_context,
         landmarks,
         photo_poses: has_poses.then(|| shard::photo_poses(&inputs.split, &views.used)),
-        store,
-        context,
     };
     let finished = maker.build(&index, budget)?;
-    context.progress.end();
+    plan.context.progress.end();
     let mut n_entries = vec![0; inputs.split.cells.len()];
     index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
     let mut built = BuiltCells {
@@ -156,29 +148,28 @@ fn refine(
     scene: &SceneContributions<'_>,
     table: RegionTable,
     score_context: &ScoreMetricContext,
-    context: &RunContext<'_>,
 ) -> Result<(RegionTable, Refinement, Option<SceneObjects>), EncodeError> {
     let settings = plan.settings;
-    context.begin_phase(Phase::Superpoints);
-    context.progress.begin("objects", "step", 3, 0);
-    let begin = || context.install(|| PendingRefinement::begin(settings.aggregation, scene, table));
-    let pending = context.time("superpoints", begin)?;
-    context.progress.advance(1);
+    plan.context.begin_phase(Phase::Superpoints);
+    plan.context.progress.begin("objects", "step", 3, 0);
+    let begin = || plan.context.install(|| PendingRefinement::begin(settings.aggregation, scene, table));
+    let pending = plan.context.time("superpoints", begin)?;
+    plan.context.progress.advance(1);
     // From all masks alike, whatever their weight in the refinement.
-    context.begin_phase(Phase::Objects);
+    plan.context.begin_phase(Phase::Objects);
     let (views, superpoints) = (pending.table(), pending.superpoints());
-    let find = || context.install(|| objects::find(scene, views, superpoints, score_context));
-    let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
-    context.progress.advance(1);
+    let find = || plan.context.install(|| objects::find(scene, views, superpoints, score_context));
+    let objects = settings.cells.objects.then(|| plan.context.time("objects", find)).transpose()?;
+    plan.context.progress.advance(1);
     if let Some(found) = &objects {
-        context.progress.objects(&mut found.objects.iter().map(Object::found));
+        plan.context.progress.objects(&mut found.objects.iter().map(Object::found));
     }
-    context.begin_phase(Phase::Refine);
+    plan.context.begin_phase(Phase::Refine);
     let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
-    let finish = || context.install(|| pending.finish(scene, object_of));
-    let (table, refinement) = context.time("refine", finish)?;
-    context.progress.advance(1);
-    context.progress.end();
+    let finish = || plan.context.install(|| pending.finish(scene, object_of));
+    let (table, refinement) = plan.context.time("refine", finish)?;
+    plan.context.progress.advance(1);
+    plan.context.progress.end();
     Ok((table, refinement, objects))
 }
 
@@ -186,16 +177,16 @@ fn thumbnails(
     plan: &Plan<'_>,
     objects: &[Object],
     views: &DoneViews<'_>,
-    context: &RunContext<'_>,
 ) -> Result<Vec<Vec<u8>>, EncodeError> {
     let load = |view: &View| {
         let photo = ingest::load_image(view)?.image;
         plan.job.check_unchanged(view, plan.segmenter.as_ref())?;
         Ok::<_, EncodeError>(photo)
     };
-    let cut = || objects::cut_thumbnails(objects, &views.used, load, context.progress, context.cancel);
-    let (thumbnails, fault) = context.time("thumbnails", || context.install(cut));
-    if context.is_cancelled() {
+    let cut =
+        || objects::cut_thumbnails(objects, &views.used, load, plan.context.progress, plan.context.cancel);
+    let (thumbnails, fault) = plan.context.time("thumbnails", || plan.context.install(cut));
+    if plan.context.is_cancelled() {
         return Err(ContributionError::Cancelled.into());
     }
     if let Some(fault) = fault {
@@ -205,21 +196,21 @@ fn thumbnails(
     Ok(thumbnails)
 }
 
-fn put_extras(plan: &Plan<'_>, table: &RegionTable, context: &RunContext<'_>) -> Result<Extras, EncodeError> {
+fn put_extras(plan: &Plan<'_>, table: &RegionTable) -> Result<Extras, EncodeError> {
     let Plan { store, settings, .. } = *plan;
     let mut extras = Extras::new();
     if settings.aggregation != Aggregation::PLAIN {
         let record = serde_json::to_vec(&settings.aggregation).map_err(std::io::Error::from)?;
         extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
     }
-    let regions = context.install(|| store.put_object(|out| table.write(out)))?.0;
+    let regions = plan.context.install(|| store.put_object(|out| table.write(out)))?.0;
     extras.insert(EXTRA_REGIONS.into(), regions);
     Ok(extras)
 }
 
-fn text_bank(plan: &Plan<'_>, context: &RunContext<'_>) -> TextBank {
+fn text_bank(plan: &Plan<'_>) -> TextBank {
     let models = plan.engines.models;
-    context.time("texts", || match models.text_encoder(plan.engines.session) {
+    plan.context.time("texts", || match models.text_encoder(plan.engines.session) {
         Ok(mut encoder) => TextBank::of_model(&mut *encoder),
         Err(e) => {
             tracing::warn!("{e}; codebooks are made for queries in all directions alike");
@@ -257,14 +248,13 @@ impl Opened {
         plan: &Plan<'_>,
         views: &DoneViews<'_>,
         occupancy: Option<&SceneOccupancy>,
-        context: &RunContext<'_>,
     ) -> Result<Self, EncodeError> {
         let (models, job, split) = (plan.engines.models, &plan.job, &plan.inputs.split);
-        let bank = text_bank(plan, context);
+        let bank = text_bank(plan);
         let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
         let paths: Vec<PathBuf> = views.used.iter().map(|view| job.contributions_path(&view.name)).collect();
         let (index, mut table) =
-            context.time("merge", || ContributionIndex::open(&paths, models.dim(), &n_gaussians))?;
+            plan.context.time("merge", || ContributionIndex::open(&paths, models.dim(), &n_gaussians))?;
         let photo = |(view, n_masks): (&&View, usize)| -> Result<Photo, ContributionError> {
             let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
             Ok(Photo { name: view.name.clone(), outlines })
@@ -292,10 +282,10 @@ impl Opened {
         // objects is free again by then.
         let rest_bytes = memory.rest_of(Phase::Cells);
         let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
-        let n_more =
-            (spare_bytes / cell_bytes.max(1)).min(context.workers.shared.current_num_threads() as u64 - 1);
+        let n_more = (spare_bytes / cell_bytes.max(1))
+            .min(plan.context.workers.shared.current_num_threads() as u64 - 1);
         let group_bytes = (rest_bytes - n_more * cell_bytes).min(pass_bytes);
-        let score_context = context.time("texts", || {
+        let score_context = plan.context.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);
             let spread = metric.spread(table.mask_vectors());
             ScoreMetricContext { metric, bank, spread }
@@ -307,27 +297,22 @@ impl Opened {
     }
 }
 
-pub(super) struct CellMaker<'a> {
-    pub(super) scene: &'a Gaussians,
-    pub(super) split: &'a CellSplit,
-    pub(super) settings: &'a ShardSettings,
-    pub(super) encoder_id: Hash32,
-    pub(super) table: RegionTable,
-    pub(super) refinement: Refinement,
-    pub(super) objects: Option<SceneObjects>,
-    pub(super) occupancy: Option<SceneOccupancy>,
-    pub(super) score_context: ScoreMetricContext,
+struct CellMaker<'a> {
+    plan: &'a Plan<'a>,
+    table: RegionTable,
+    refinement: Refinement,
+    objects: Option<SceneObjects>,
+    occupancy: Option<SceneOccupancy>,
+    score_context: ScoreMetricContext,
     /// Camera poses by cell, if the shards store them.
-    pub(super) photo_poses: Option<Vec<BuiltPhotoPoses>>,
-    pub(super) landmarks: Option<Vec<BuiltLandmarks>>,
-    pub(super) store: &'a Store,
-    pub(super) context: &'a RunContext<'a>,
+    photo_poses: Option<Vec<BuiltPhotoPoses>>,
+    landmarks: Option<Vec<BuiltLandmarks>>,
 }
 
 #[derive(Clone, Copy)]
-pub(super) struct CellsBudget {
-    pub(super) group_bytes: u64,
-    pub(super) n_at_once: usize,
+struct CellsBudget {
+    group_bytes: u64,
+    n_at_once: usize,
 }
 
 /// A cell while its parts are lifted.
@@ -345,23 +330,23 @@ impl CellInWork {
 
 /// A cell whose shards are in the store.
 #[derive(Debug)]
-pub(super) struct FinishedCell {
-    pub(super) record: CellRecord,
-    pub(super) fields: Vec<(String, Hash32)>,
-    pub(super) n_subspaces: u32,
-    pub(super) n_without_evidence: u64,
+struct FinishedCell {
+    record: CellRecord,
+    fields: Vec<(String, Hash32)>,
+    n_subspaces: u32,
+    n_without_evidence: u64,
     /// Over Gaussians with evidence: sums of mean score and mean squared score, and their number.
-    pub(super) score_sums: [f64; 3],
+    score_sums: [f64; 3],
 }
 
 impl CellMaker<'_> {
     /// Lifts cells and makes their shards, several at once.
-    pub(super) fn build(
+    fn build(
         &self,
         index: &ContributionIndex,
         budget: CellsBudget,
     ) -> Result<Vec<FinishedCell>, EncodeError> {
-        let context = self.context;
+        let context = self.plan.context;
         // A large cell's vectors are allocated once and reused, neither copied nor cleared.
         let free = (0..budget.n_at_once).map(|_| CellInWork::empty(self.table.dim())).collect();
         let lent = Lanes::new([(0, free)]);
@@ -375,7 +360,7 @@ impl CellMaker<'_> {
         let has_failed = AtomicBool::new(false);
         let is_stopped = || context.is_cancelled() || has_failed.load(Ordering::Relaxed);
         let workers = &context.workers;
-        let n_alone = workers.n_alone(self.split.cells.len(), budget.n_at_once);
+        let n_alone = workers.n_alone(self.plan.inputs.split.cells.len(), budget.n_at_once);
         std::thread::scope(|scope| -> Result<(), EncodeError> {
             let mut parts = context.install(|| index.transposed_parts(&self.table, budget.group_bytes));
             let mut next_part = || context.time("merge", || context.install(|| parts.next()));
@@ -386,7 +371,9 @@ impl CellMaker<'_> {
                 }
                 let contributions = contributions?;
                 let cell_id = contributions.part.cell_id;
-                if contributions.part.locals.end < self.split.cells[cell_id as usize].gaussians.len() {
+                if contributions.part.locals.end
+                    < self.plan.inputs.split.cells[cell_id as usize].gaussians.len()
+                {
                     // Large cells come in parts, so that only one part is held.
                     context.install(|| self.add_part(contributions, &mut cell))?;
                     continue;
@@ -418,25 +405,26 @@ impl CellMaker<'_> {
         cell: &mut CellInWork,
     ) -> Result<(), EncodeError> {
         let part = contributions.part.clone();
-        let gaussians = &self.split.cells[part.cell_id as usize].gaussians;
+        let gaussians = &self.plan.inputs.split.cells[part.cell_id as usize].gaussians;
         let CellInWork { embeddings: cell, fields, .. } = cell;
         let len = cell.vectors.len().max(gaussians.len() * cell.dim);
         cell.vectors.reserve_exact(len - cell.vectors.len());
         cell.vectors.resize(len, 0.0);
         let vectors = &mut cell.vectors[part.locals.start * cell.dim..part.locals.end * cell.dim];
-        let field = self.context.time("lift", || {
+        let field = self.plan.context.time("lift", || {
             self.refinement.apply(&mut contributions, &gaussians[part.locals.clone()]);
             CellField::new(gaussians[part.locals.clone()].to_vec(), contributions, &self.table, vectors)
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
-        let (hash, _) = self.context.time("write", || self.store.put_object(|out| field.write(out)))?;
+        let (hash, _) =
+            self.plan.context.time("write", || self.plan.store.put_object(|out| field.write(out)))?;
         fields.push((extra_field(part.cell_id, part.number), hash));
         Ok(())
     }
 
     fn finish(&self, cell_id: u32, in_work: &mut CellInWork) -> Result<FinishedCell, EncodeError> {
-        let cell = &self.split.cells[cell_id as usize];
-        let Self { scene, settings, encoder_id, score_context, .. } = self;
+        let cell = &self.plan.inputs.split.cells[cell_id as usize];
+        let Plan { inputs, settings, engines, .. } = self.plan;
         let occupancy = self.occupancy.as_ref().map(|scene| scene.cells[cell_id as usize].view());
         let none = BuiltPhotoPoses::default();
         let photo_poses = self.photo_poses.as_ref().map_or(&none, |of_cells| &of_cells[cell_id as usize]);
@@ -444,12 +432,18 @@ impl CellMaker<'_> {
         let landmarks = self.landmarks.as_ref().and_then(|of_cells| of_cells[cell_id as usize].view());
         let extras = CellExtras { objects, occupancy, photo_poses: photo_poses.view(), landmarks };
         let embeddings = &in_work.embeddings;
-        let made = self.context.time("codebook", || {
-            ShardBuilder { scene, encoder_id: *encoder_id, score_context, settings }
-                .build(cell_id, cell, embeddings, extras)
+        let made = self.plan.context.time("codebook", || {
+            ShardBuilder {
+                scene: &inputs.scene,
+                encoder_id: Hash32(engines.models.encoder_id().hash()),
+                score_context: &self.score_context,
+                settings: &settings.cells.shards,
+            }
+            .build(cell_id, cell, embeddings, extras)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
-            let (hash, len_bytes) = self.context.time("write", || self.store.put_bytes(&shard.bytes))?;
+            let (hash, len_bytes) =
+                self.plan.context.time("write", || self.plan.store.put_bytes(&shard.bytes))?;
             let record = ShardRecord {
                 hash,
                 len_bytes,

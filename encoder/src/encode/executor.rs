@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use slag_common::View;
 
-use super::context::{Engines, RunContext};
+use super::context::Engines;
 use super::error::EncodeError;
 use super::pipeline;
 use super::plan::Plan;
@@ -24,31 +24,30 @@ impl Executor for Here {
         &self,
         plan: &Plan<'_>,
         done: &BTreeMap<String, ViewRecord>,
-        context: &RunContext<'_>,
     ) -> Result<ViewsRun, EncodeError> {
         let run = &plan.settings.run;
-        let stages = ViewStages::new(plan.view_tools(), context);
+        let stages = ViewStages::new(plan.view_tools());
         let views = || plan.order.iter().map(|view| &plan.inputs.views[*view]);
         let open = views().filter(|view| !done.contains_key(&view.name));
-        let deadline = run.time_budget.and_then(|budget| context.start.checked_add(budget));
+        let deadline = run.time_budget.and_then(|budget| plan.context.start.checked_add(budget));
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let mut has_some = views().any(|view| done.contains_key(&view.name));
         // At least one view is used, however late it is.
         let mut may_begin = || !std::mem::replace(&mut has_some, true) || !is_over();
         // After ctrl-c no view begins; those under way are finished.
-        let n_alone = context.workers.n_alone(open.clone().count(), run.threads);
+        let n_alone = plan.context.workers.n_alone(open.clone().count(), run.threads);
         let source = open
-            .take_while(|_| !context.is_cancelled() && may_begin())
+            .take_while(|_| !plan.context.is_cancelled() && may_begin())
             .enumerate()
             .map(|(i, view)| (i < n_alone, view));
         let skipped = Mutex::new(LeftOut::default());
         let start = Instant::now();
-        let mut reports = work_off(&stages, run.threads, source, context, |view, error| {
+        let mut reports = work_off(&stages, source, |view, error| {
             if run.strict {
                 return Err(error);
             }
             let reason = error.to_string();
-            context.progress.left_out(&view.name, &reason);
+            plan.context.progress.left_out(&view.name, &reason);
             skipped.lock().unwrap_or_else(PoisonError::into_inner).push(view.name.clone(), reason);
             Ok(())
         })?;
@@ -56,7 +55,7 @@ impl Executor for Here {
         for report in &mut reports {
             report.add_gpus(stages.loads(&report.stage), wall_secs);
         }
-        if context.is_cancelled() {
+        if plan.context.is_cancelled() {
             let n_done = plan.job.done_views()?.len();
             return Err(EncodeError::Interrupted { n_done, n_views: plan.order.len() });
         }
@@ -72,19 +71,17 @@ impl Executor for Here {
 /// Those of the stages that lie in no view, and those of `on_bad_view`.
 pub(crate) fn work_off<'v>(
     stages: &ViewStages<'_>,
-    n_threads: usize,
     source: impl Iterator<Item = (bool, &'v View)> + Send,
-    context: &RunContext<'_>,
     on_bad_view: impl Fn(&View, EncodeError) -> Result<(), EncodeError> + Sync,
 ) -> Result<Vec<StageReport>, EncodeError> {
-    let list = stages.tools.stages();
-    let is_here = stages.tools.photos.is_none();
+    let tools = &stages.tools;
+    let (list, is_here) = (tools.stages(), tools.photos.is_none());
     let source = source.map(|(is_alone, view)| (is_alone, Work::begin(view, is_here)));
-    let done = pipeline::run(&list, n_threads, source, |at, (is_alone, work)| {
+    let done = pipeline::run(&list, tools.n_threads, source, |at, (is_alone, work)| {
         let view = work.view;
         // Stages that wait for a device or the disk must not hold a thread of the run.
         let result = match list[at].on_cpu {
-            true => context.workers.run(is_alone, || stages.step(work)),
+            true => tools.context.workers.run(is_alone, || stages.step(work)),
             false => stages.step(work),
         };
         match result {
@@ -110,7 +107,6 @@ pub(crate) trait Executor {
         &self,
         plan: &Plan<'_>,
         done: &BTreeMap<String, ViewRecord>,
-        context: &RunContext<'_>,
     ) -> Result<ViewsRun, EncodeError>;
 
     /// Called once, before the manifest is published.

@@ -7,8 +7,7 @@ use std::time::Instant;
 use slag_common::Hash32;
 use slag_models::SessionOptions;
 
-use super::context::Engines;
-use super::context::RunContext;
+use super::context::{Engines, RunContext};
 use super::coverage::{self, Coverage};
 use super::error::EncodeError;
 use super::identity;
@@ -31,6 +30,7 @@ use crate::shard;
 use crate::store::{Store, StoreReader};
 
 pub(crate) struct Plan<'a> {
+    pub(crate) context: &'a RunContext<'a>,
     pub(crate) settings: &'a EncodeSettings,
     pub(crate) engines: &'a Engines<'a>,
     pub(crate) inputs: &'a Inputs,
@@ -51,6 +51,7 @@ pub(crate) struct Plan<'a> {
 impl Plan<'_> {
     pub(super) fn view_tools(&self) -> ViewTools<'_> {
         ViewTools {
+            context: self.context,
             engines: self.engines,
             settings: &self.settings.view,
             n_threads: self.settings.run.threads,
@@ -71,7 +72,7 @@ pub(super) fn plan<'a>(
     store: &'a Store,
     inputs: &'a Inputs,
     rasterizer: &str,
-    context: &RunContext<'_>,
+    context: &'a RunContext<'a>,
 ) -> Result<Plan<'a>, EncodeError> {
     let memory = memory_plan(settings, inputs, engines);
     memory.rest(0)?;
@@ -95,6 +96,7 @@ pub(super) fn plan<'a>(
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
     let plan = Plan {
+        context,
         settings,
         engines,
         inputs,

@@ -12,7 +12,6 @@ use slag_common::shard::ScoreErrors;
 use slag_models::ModelDir;
 
 use super::cells::{BuiltCells, Counts};
-use super::context::RunContext;
 use super::error::EncodeError;
 use super::executor::Executor;
 use super::plan::Plan;
@@ -30,7 +29,6 @@ pub(super) fn publish(
     views: DoneViews<'_>,
     built: BuiltCells,
     executor: &dyn Executor,
-    context: &RunContext<'_>,
 ) -> Result<EncodeSummary, EncodeError> {
     let n_gaussians = plan.inputs.scene.len() - plan.inputs.split.n_rejected;
     if built.n_without_evidence >= n_gaussians as u64 && !plan.settings.run.allow_empty {
@@ -51,6 +49,7 @@ pub(super) fn publish(
     plan.store.publish(&manifest, &built.extras)?;
     let mut summary = summary(&plan, &views, built, &manifest);
     leave_out_blind(&mut summary);
+    let context = plan.context;
     // With views left to do, contributions stay for the next encode.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
     let store = plan.store;

@@ -68,6 +68,7 @@ pub(crate) trait ViewSink: Sync {
 
 #[derive(Clone, Copy)]
 pub(crate) struct ViewTools<'a> {
+    pub(crate) context: &'a RunContext<'a>,
     pub(crate) engines: &'a Engines<'a>,
     pub(crate) settings: &'a ViewSettings,
     pub(crate) n_threads: usize,
@@ -82,7 +83,6 @@ pub(crate) struct ViewTools<'a> {
 
 pub(crate) struct ViewStages<'a> {
     pub(super) tools: ViewTools<'a>,
-    context: &'a RunContext<'a>,
     /// How crops become the image encoder's squares; `None` if it takes any size.
     preprocess: Option<Preprocess>,
     encoders: Encoders,
@@ -206,7 +206,7 @@ impl ViewTools<'_> {
 }
 
 impl<'a> ViewStages<'a> {
-    pub(crate) fn new(tools: ViewTools<'a>, context: &'a RunContext<'a>) -> Self {
+    pub(crate) fn new(tools: ViewTools<'a>) -> Self {
         let (models, session) = (tools.engines.models.clone(), tools.engines.session.clone());
         let preprocess = models.preprocess();
         let is_on_cpu = session.is_on_cpu();
@@ -223,7 +223,6 @@ impl<'a> ViewStages<'a> {
         };
         Self {
             tools,
-            context,
             preprocess,
             encoders,
             images_on,
@@ -302,6 +301,7 @@ impl<'a> ViewStages<'a> {
         // A GPU waits for colours that these threads compute, rather than they for it.
         let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
         let drawing = self
+            .tools
             .context
             .install(draw)
             .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
@@ -317,13 +317,13 @@ impl<'a> ViewStages<'a> {
         loaded: &LoadedImage,
         depth: Option<&[f32]>,
     ) -> Result<Vec<Mask>, EncodeError> {
-        let pool = Some(&self.context.workers.shared);
+        let pool = Some(&self.tools.context.workers.shared);
         let input = SegmentInput { pool, ..SegmentInput::new(loaded, depth) };
         let mut masks = self.tools.segmenter.segment(&input)?;
         let min_mask_px = self.tools.settings.min_mask_px;
         masks.retain(|mask| mask.level == Mask::STANDING || mask.area_px >= min_mask_px);
         let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
-        self.context.progress.segmented(&view.name, masks.len(), &draw);
+        self.tools.context.progress.segmented(&view.name, masks.len(), &draw);
         Ok(masks)
     }
 
@@ -457,7 +457,7 @@ impl<'a> ViewStages<'a> {
         let record = ViewRecord { raster_width_px: lifted.raster_width_px, secs };
         self.tools.sink.check_unchanged(view, self.tools.segmenter)?;
         self.tools.sink.keep(view, &lifted.contributions, &lifted.outlines, record)?;
-        self.context.progress.advance(1);
+        self.tools.context.progress.advance(1);
         Ok(())
     }
 }

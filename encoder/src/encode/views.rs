@@ -7,7 +7,6 @@ use std::time::Instant;
 use slag_common::View;
 use slag_common::landmarks::BuiltLandmarks;
 
-use super::context::RunContext;
 use super::coverage::CoverageReport;
 use super::error::EncodeError;
 use super::executor::{Executor, ViewsRun};
@@ -41,21 +40,17 @@ pub(super) struct DoneViews<'a> {
 ///
 /// # Errors
 /// [`EncodeError`]; finished views stay finished.
-pub(super) fn run_views<'a>(
-    plan: &Plan<'a>,
-    executor: &dyn Executor,
-    context: &RunContext<'_>,
-) -> Result<DoneViews<'a>, EncodeError> {
+pub(super) fn run_views<'a>(plan: &Plan<'a>, executor: &dyn Executor) -> Result<DoneViews<'a>, EncodeError> {
     let views = &plan.inputs.views;
     let done = plan.job.done_views()?;
     let n_resumed = plan.order.iter().filter(|view| done.contains_key(&views[**view].name)).count();
     let planned: Vec<&View> = plan.order.iter().map(|view| &views[*view]).collect();
     let cells: Vec<_> = plan.inputs.split.cells.iter().map(|cell| cell.mean_bounds).collect();
-    context.progress.plan(&planned, &cells);
+    plan.context.progress.plan(&planned, &cells);
     let start = Instant::now();
-    context.progress.begin("views", "view", plan.order.len() as u64, n_resumed as u64);
-    let ViewsRun { stages, skipped: failed, images_on } = executor.run_views(plan, &done, context)?;
-    context.progress.end();
+    plan.context.progress.begin("views", "view", plan.order.len() as u64, n_resumed as u64);
+    let ViewsRun { stages, skipped: failed, images_on } = executor.run_views(plan, &done)?;
+    plan.context.progress.end();
     let secs = start.elapsed().as_secs_f64();
     let n_failed = failed.len();
     let mut skipped = [&plan.inputs.missing[..], &failed[..]].concat();
@@ -77,15 +72,14 @@ pub(super) fn run_views<'a>(
 pub(super) fn look_around(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
-    context: &RunContext<'_>,
 ) -> Result<Option<SceneOccupancy>, EncodeError> {
     let Some(settings) = plan.settings.cells.occupancy else { return Ok(None) };
-    context.begin_phase(Phase::Occupancy);
+    plan.context.begin_phase(Phase::Occupancy);
     let Inputs { scene, split, .. } = plan.inputs;
     let drawn = plan.scene.as_ref();
     let memory = plan.memory.clone();
-    let find = || occupancy::find(scene, split, drawn, &views.used, settings, memory, context.cancel);
-    let found = context.time("occupancy", || context.install(find));
+    let find = || occupancy::find(scene, split, drawn, &views.used, settings, memory, plan.context.cancel);
+    let found = plan.context.time("occupancy", || plan.context.install(find));
     let found = found
         .map_err(|error| match error {
             OccupancyError::Memory(error) => error.into(),
@@ -101,28 +95,27 @@ pub(super) fn look_around(
 pub(super) fn find_landmarks(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
-    context: &RunContext<'_>,
 ) -> Result<Option<Vec<BuiltLandmarks>>, EncodeError> {
     if !plan.settings.cells.landmarks {
         return Ok(None);
     }
-    context.begin_phase(Phase::Landmarks);
+    plan.context.begin_phase(Phase::Landmarks);
     let n_views = views.used.len();
-    context.progress.begin("landmarks", "view", n_views as u64, 0);
+    plan.context.progress.begin("landmarks", "view", n_views as u64, 0);
     let mut mapping = Vec::with_capacity(n_views);
     for (number, view) in views.used.iter().enumerate() {
-        if context.cancel.load(Ordering::Relaxed) {
+        if plan.context.cancel.load(Ordering::Relaxed) {
             return Err(EncodeError::Interrupted { n_done: n_views, n_views });
         }
         let observe = || landmarks::observe(plan.scene.as_ref(), number as u16, view);
-        let observed = context.time("landmarks", || context.install(observe));
+        let observed = plan.context.time("landmarks", || plan.context.install(observe));
         let failed = |source| EncodeError::Landmarks { view: view.name.clone(), source };
         mapping.push(observed.map_err(failed)?);
         plan.job.check_unchanged(view, plan.segmenter.as_ref())?;
-        context.progress.advance(1);
+        plan.context.progress.advance(1);
     }
-    context.progress.end();
+    plan.context.progress.end();
     let Inputs { scene, split, .. } = plan.inputs;
-    let found = context.time("landmarks", || landmarks::landmarks(&mapping, scene.len()));
+    let found = plan.context.time("landmarks", || landmarks::landmarks(&mapping, scene.len()));
     Ok(Some(shard::landmarks(split, slag_locate::CODE_VERSION, &found)))
 }

@@ -16,7 +16,7 @@ use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, RunContext, ViewRecord, ViewsRun};
+use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, ViewRecord, ViewsRun};
 use crate::encode::{EncodeError, Engines, SkippedView};
 
 pub(crate) struct Coordinator {
@@ -36,11 +36,10 @@ impl Coordinator {
         &self,
         plan: &Plan<'_>,
         done: &BTreeMap<String, ViewRecord>,
-        context: &RunContext<'_>,
     ) -> Result<ViewsInWork<'_>, FleetError> {
         let is_open = |view: &usize| !done.contains_key(&plan.inputs.views[*view].name);
         let open: Vec<usize> = plan.order.iter().copied().filter(is_open).collect();
-        let run_plan = inputs::upload(&self.bucket, plan, &open, context)?;
+        let run_plan = inputs::upload(&self.bucket, plan, &open)?;
         let run = Run::begin(&self.bucket, &run_plan)?;
         let open_queue = |queue| Enqueuer::open(&self.bucket.runtime, queue, run, run_plan.of_scene);
         let queue = self.queue.as_ref().map(open_queue).transpose()?;
@@ -66,13 +65,12 @@ impl Executor for Coordinator {
         &self,
         plan: &Plan<'_>,
         done: &BTreeMap<String, ViewRecord>,
-        context: &RunContext<'_>,
     ) -> Result<ViewsRun, EncodeError> {
-        let mut views = self.begin(plan, done, context)?;
+        let mut views = self.begin(plan, done)?;
         while !views.open.is_empty() {
-            let n_fetched = views.fetch_done(plan, context)?;
+            let n_fetched = views.fetch_done(plan)?;
             views.take_failed(plan.settings.run.strict)?;
-            if context.is_cancelled() {
+            if plan.context.is_cancelled() {
                 let n_done = plan.job.done_views()?.len();
                 return Err(EncodeError::Interrupted { n_done, n_views: plan.order.len() });
             }
@@ -103,17 +101,17 @@ struct ViewsInWork<'a> {
 
 impl ViewsInWork<'_> {
     /// Downloads finished views into this machine's job; returns their number.
-    fn fetch_done(&mut self, plan: &Plan<'_>, context: &RunContext<'_>) -> Result<usize, FleetError> {
+    fn fetch_done(&mut self, plan: &Plan<'_>) -> Result<usize, FleetError> {
         let names = self.bucket.list("views")?;
         let there: BTreeSet<Hash32> = names.iter().filter_map(|name| name.parse().ok()).collect();
         let fresh: Vec<(&Hash32, &(usize, String))> =
             self.open.iter().filter(|(id, _)| there.contains(id)).collect();
         let fetch = |(id, (_, name)): &(&Hash32, &(usize, String))| {
             self.fetch_view(plan, **id, name)?;
-            context.progress.advance(1);
+            plan.context.progress.advance(1);
             Ok::<_, FleetError>(())
         };
-        context.install(|| fresh.par_iter().try_for_each(fetch))?;
+        plan.context.install(|| fresh.par_iter().try_for_each(fetch))?;
         let n_fresh = fresh.len();
         self.open.retain(|id, _| !there.contains(id));
         Ok(n_fresh)

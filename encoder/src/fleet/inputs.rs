@@ -12,17 +12,12 @@ use super::error::FleetError;
 use super::objects;
 use crate::blobs::Bucket;
 use crate::encode::Masks;
-use crate::encode::fleet_parts::{Plan, RunContext, ViewSink};
+use crate::encode::fleet_parts::{Plan, ViewSink};
 use crate::ingest;
 use crate::segment;
 
 /// Uploads the scene and the open views' files; returns the plan of a run. `open`: indices of views.
-pub(super) fn upload(
-    bucket: &Bucket,
-    plan: &Plan<'_>,
-    open: &[usize],
-    context: &RunContext<'_>,
-) -> Result<RunPlan, FleetError> {
+pub(super) fn upload(bucket: &Bucket, plan: &Plan<'_>, open: &[usize]) -> Result<RunPlan, FleetError> {
     let there: BTreeSet<String> = bucket.list("inputs")?.into_iter().collect();
     let put = |bytes: Vec<u8>| -> Result<Hash32, FleetError> {
         let hash = Hash32::of(&bytes);
@@ -61,7 +56,7 @@ pub(super) fn upload(
         Ok((cost, planned))
     };
     let mut views: Vec<(u64, PlannedView)> =
-        context.install(|| open.par_iter().map(planned).collect::<Result<_, _>>())?;
+        plan.context.install(|| open.par_iter().map(planned).collect::<Result<_, _>>())?;
     views.sort_by_key(|(cost, _)| std::cmp::Reverse(*cost));
     Ok(RunPlan {
         program: documents::own_version(),

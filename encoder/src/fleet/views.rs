@@ -23,6 +23,7 @@ use crate::segment::Segmenter;
 const N_AT_ONCE: usize = 2;
 
 pub(super) struct ViewWork<'a> {
+    pub(super) context: &'a RunContext<'a>,
     pub(super) bucket: &'a Bucket,
     pub(super) prepared: &'a Prepared,
     pub(super) engines: &'a Engines<'a>,
@@ -37,6 +38,7 @@ pub(super) struct ViewWork<'a> {
 impl ViewWork<'_> {
     pub(super) fn tools(&self) -> ViewTools<'_> {
         ViewTools {
+            context: self.context,
             engines: self.engines,
             settings: &self.prepared.settings,
             n_threads: self.n_threads,
@@ -50,12 +52,12 @@ impl ViewWork<'_> {
     }
 
     /// Does the available views; ends when there are none at present.
-    pub(super) fn run(&self, context: &RunContext<'_>) -> Result<(), FleetError> {
+    pub(super) fn run(&self) -> Result<(), FleetError> {
         let prepared = self.prepared;
-        let stages = ViewStages::new(self.tools(), context);
-        let source = views_to_do(self.dispatcher, &prepared.views, || context.is_cancelled());
+        let stages = ViewStages::new(self.tools());
+        let source = views_to_do(self.dispatcher, &prepared.views, || self.context.is_cancelled());
         let source = source.map(|view| (true, view));
-        work_off(&stages, self.n_threads, source, context, |view, error| {
+        work_off(&stages, source, |view, error| {
             // The coordinator warns of the first few.
             tracing::info!("view {} fails: {error}", view.name);
             Ok(self.fail(view, &error.to_string())?)

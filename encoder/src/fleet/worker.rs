@@ -117,6 +117,7 @@ fn work_for(
     };
     let scene = context.install(|| engines.rasterizer.load(&prepared.scene)).map_err(EncodeError::from)?;
     let work = ViewWork {
+        context,
         bucket,
         prepared: &prepared,
         engines,
@@ -128,20 +129,16 @@ fn work_for(
         n_done: AtomicUsize::new(0),
     };
     prepared.check_memory(settings.memory_bytes, &work.tools())?;
-    let result = while_open(&work, HeartbeatWatch::new(run, settings.patience), context);
+    let result = while_open(&work, HeartbeatWatch::new(run, settings.patience));
     report.n_views += work.n_done.load(Ordering::Relaxed);
     result
 }
 
-fn while_open(
-    work: &ViewWork<'_>,
-    mut coordinator: HeartbeatWatch,
-    context: &RunContext<'_>,
-) -> Result<(), FleetError> {
-    let ViewWork { bucket, dispatcher, prepared, .. } = *work;
+fn while_open(work: &ViewWork<'_>, mut coordinator: HeartbeatWatch) -> Result<(), FleetError> {
+    let ViewWork { context, bucket, dispatcher, prepared, .. } = *work;
     loop {
         dispatcher.offer(&mut || open_views(bucket, prepared))?;
-        work.run(context)?;
+        work.run()?;
         loop {
             record_failures(bucket, prepared.run, dispatcher)?;
             if context.is_cancelled() || !prepared.run.is_open(bucket)? {
