@@ -6,9 +6,9 @@ use glam::{DQuat, DVec3};
 use serde::Serialize;
 use slag_common::{Gaussians, Similarity};
 
-use super::error::CheckError;
 use super::mistake::{FrameCandidate, FrameCause, Mistake};
-use super::options::CheckOptions;
+use super::report::CheckError;
+use super::report::CheckOptions;
 use super::suspicion::{at_per_mille, camera_spread, scene_diagonal};
 use super::view::{CheckView, at_width, mean};
 use crate::raster::{LoadedScene, Rasterizer};
@@ -277,10 +277,7 @@ impl Search<'_> {
         }
         Ok(if found.psnr_db > best.psnr_db + least_gain_db { found } else { best })
     }
-}
 
-impl Search<'_> {
-    /// Refines a factor of focal lengths, of which few are tried.
     fn refined_focal(&self, best: Trial) -> Result<Trial, CheckError> {
         let (mut found, mut step) = (best, FIRST_FOCAL_STEP);
         for _ in 0..=HALVINGS {

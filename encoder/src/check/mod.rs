@@ -5,9 +5,7 @@
 
 mod align;
 mod diagnosis;
-mod error;
 mod mistake;
-mod options;
 mod report;
 mod suspicion;
 #[cfg(test)]
@@ -23,9 +21,9 @@ use view::{PLAIN_DB, at_width, mean, picture, picture_name};
 
 pub(crate) use align::Alignment;
 pub use align::align;
-pub use error::CheckError;
 pub use mistake::{FrameCandidate, FrameCause, Mistake, nerfstudio_defaults};
-pub use options::CheckOptions;
+pub use report::CheckError;
+pub use report::CheckOptions;
 pub use report::CheckReport;
 pub(crate) use report::ViewCheck;
 pub use suspicion::{Suspicion, suspicions};

@@ -1,10 +1,15 @@
-//! The report of a check, as a table or as JSON.
+//! What a check is asked, its report as a table or as JSON, and why it fails.
 
 use std::fmt;
+use std::path::PathBuf;
 
 use serde::Serialize;
 
 use super::diagnosis::Diagnosis;
+use super::mistake::FrameCandidate;
+use super::suspicion::Suspicion;
+use crate::ingest::IngestError;
+use crate::raster::RasterError;
 
 /// A drawing with this PSNR looks much like its photo.
 const ALIKE_DB: f64 = 25.0;
@@ -78,6 +83,54 @@ impl fmt::Display for CheckReport {
             }
         }
     }
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub struct CheckOptions {
+    /// Width at which views are compared, pixels. Photos are never enlarged.
+    pub width_px: u32,
+    /// Folder for a picture of each view (photo left, drawing right); `None` writes no pictures.
+    pub pictures_dir: Option<PathBuf>,
+    pub diagnosis_width_px: u32,
+    /// Number of views in which mistakes are searched, spread evenly over all views.
+    pub diagnosis_views: usize,
+    /// Similarities between the worlds of poses and splat that are tried beside common mistakes.
+    pub frames: Vec<FrameCandidate>,
+    pub suspicions: Vec<Suspicion>,
+}
+
+impl Default for CheckOptions {
+    fn default() -> Self {
+        Self {
+            width_px: 800,
+            pictures_dir: None,
+            diagnosis_width_px: 240,
+            diagnosis_views: 4,
+            frames: Vec::new(),
+            suspicions: Vec::new(),
+        }
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum CheckError {
+    #[error("no views to check; give at least one photo with its pose")]
+    NoViews,
+    #[error("none of the {n_views} sampled photos can be read, the first: {first}")]
+    NoPhotos { n_views: usize, first: IngestError },
+    #[error(
+        "view {view}: the photo has {} x {} px but its camera {} x {} px; give the photo that the camera describes",
+        image_px[0], image_px[1], camera_px[0], camera_px[1]
+    )]
+    ImageSize { view: String, image_px: [u32; 2], camera_px: [u32; 2] },
+    #[error("view {view}: {source}")]
+    Raster { view: String, source: RasterError },
+    #[error(transparent)]
+    Scene(#[from] RasterError),
+    #[error("view {view}: cannot encode its picture ({source}); choose a smaller width")]
+    Encode { view: String, source: image::ImageError },
+    #[error("{0}; choose another folder for the pictures")]
+    Write(#[from] std::io::Error),
 }
 
 #[cfg(test)]

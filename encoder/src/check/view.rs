@@ -5,7 +5,7 @@ use std::io::Cursor;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat, RgbImage};
 
-use super::error::CheckError;
+use super::report::CheckError;
 use crate::raster::{Drawing, LoadedScene, RasterView};
 
 #[derive(Clone, Debug)]
@@ -39,15 +39,6 @@ pub(super) fn at_width(view: &CheckView, width_px: u32) -> Result<CheckView, Che
     Ok(CheckView { name: view.name.clone(), image, valid, view: RasterView { intrinsics, ..view.view } })
 }
 
-impl CheckView {
-    /// Draws the view over black, like trainers of splats.
-    pub(super) fn draw(&self, scene: &dyn LoadedScene) -> Result<Drawing, CheckError> {
-        scene
-            .draw(&self.view, [0.0; 3])
-            .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
-    }
-}
-
 /// PSNR of a picture against a photo, dB; 100 where they are equal.
 pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
     let squares = photo.pixels().enumerate().flat_map(|(pixel, photo)| {
@@ -64,6 +55,13 @@ pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
 pub(super) const PLAIN_DB: f64 = 40.0;
 
 impl CheckView {
+    /// Draws the view over black, like trainers of splats.
+    pub(super) fn draw(&self, scene: &dyn LoadedScene) -> Result<Drawing, CheckError> {
+        scene
+            .draw(&self.view, [0.0; 3])
+            .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
+    }
+
     pub(super) fn is_plain(&self) -> bool {
         self.flat_psnr_db() >= PLAIN_DB
     }

@@ -72,7 +72,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
                 job: None,
             };
             match CatalogueCopy::of(&at.store, &std::env::temp_dir())? {
-                Some(catalogue) => {
+                Some(CatalogueCopy { catalogue, .. }) => {
                     listed.history = catalogue.generations()?;
                     listed.job = job_status(catalogue.db())?;
                 }
@@ -85,9 +85,8 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
         }
         StoreCommand::Verify(at) => {
             let reader = StoreReader::open(&at.store)?;
-            let listing = reader.listing();
-            progress.begin("verify", "file", listing.n_files() as u64, 0);
-            let verified = listing.verify(|| progress.advance(1));
+            progress.begin("verify", "file", reader.listing().len() as u64, 0);
+            let verified = reader.verify(|| progress.advance(1));
             progress.end();
             warn_of_expiry(&at.store);
             print(json, &verified, Lines(&verified))?;

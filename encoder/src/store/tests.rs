@@ -366,7 +366,7 @@ fn verification_reads_every_byte_and_names_what_is_bad() {
     let verify = || {
         let n_read = std::sync::atomic::AtomicU64::new(0);
         let reader = store.reader().expect("published");
-        let verified = reader.listing().verify(|| {
+        let verified = reader.verify(|| {
             n_read.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         });
         assert_eq!((verified.n_files, n_read.into_inner()), (3, 3));
@@ -407,7 +407,7 @@ fn a_damaged_manifest_is_published_anew() {
         let reader = store.reader().expect("whole");
         let previous = reader.previous().expect("readable").manifest.generation;
         assert_eq!((reader.manifest().generation, previous), (3, 1), "damage {number}");
-        assert!(reader.listing().verify(|| {}).bad.is_empty(), "damage {number}");
+        assert!(reader.verify(|| {}).bad.is_empty(), "damage {number}");
     }
 }
 

@@ -14,6 +14,9 @@ use super::reader::{Extras, StoreReader};
 use super::walk::{self, Refused};
 use super::{files, metadata};
 
+/// Objects of the current and the previous generation: content of each, by hash and length if a manifest states it.
+type Listing = BTreeMap<(Hash32, Option<u64>), Vec<String>>;
+
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Fault {
@@ -48,36 +51,27 @@ pub(crate) struct Verified {
     pub(crate) bad: Vec<BadFile>,
 }
 
-pub(crate) struct Listing<'a> {
-    reader: &'a StoreReader,
-    /// Content of each, by hash and length if a manifest states it.
-    holds: BTreeMap<(Hash32, Option<u64>), Vec<String>>,
-}
-
 impl StoreReader {
-    /// Objects of the current and the previous generation.
-    pub(crate) fn listing(&self) -> Listing<'_> {
-        let mut holds: BTreeMap<_, Vec<String>> = BTreeMap::new();
+    pub(crate) fn listing(&self) -> Listing {
+        let mut listing = Listing::new();
         for published in std::iter::once(self.current()).chain(self.previous()) {
+            let generation = published.manifest.generation;
             for (hash, len_bytes, what) in contents(&published.manifest, &published.extras) {
-                let generation = published.manifest.generation;
-                holds.entry((hash, len_bytes)).or_default().push(format!("{what}, generation {generation}"));
+                listing
+                    .entry((hash, len_bytes))
+                    .or_default()
+                    .push(format!("{what}, generation {generation}"));
             }
         }
-        Listing { reader: self, holds }
-    }
-}
-
-impl Listing<'_> {
-    pub(crate) fn n_files(&self) -> usize {
-        self.holds.len()
+        listing
     }
 
     /// Reads every object, several at a time, and the metadata. `on_read`: called after each, from any thread.
     pub(crate) fn verify(&self, on_read: impl Fn() + Sync) -> Verified {
+        let listing = self.listing();
         let bytes_read = AtomicU64::new(0);
         let check = |((hash, len_bytes), holds): (&(Hash32, Option<u64>), &Vec<String>)| {
-            let path = self.reader.object_path(*hash);
+            let path = self.object_path(*hash);
             let fault = match files::hash_of(&path) {
                 Ok((found, n)) => {
                     bytes_read.fetch_add(n, Ordering::Relaxed);
@@ -90,16 +84,16 @@ impl Listing<'_> {
             on_read();
             fault.map(|fault| BadFile { hash: Some(*hash), path, fault, holds: holds.clone() })
         };
-        let mut bad: Vec<BadFile> = self.holds.par_iter().filter_map(check).collect();
+        let mut bad: Vec<BadFile> = listing.par_iter().filter_map(check).collect();
         let of = |path, fault| BadFile { hash: None, path, fault, holds: Vec::new() };
-        let store = self.reader.dir();
+        let store = self.dir();
         match walk::refused(store) {
             Ok(refused) => {
                 bad.extend(refused.into_iter().map(|Refused { path, what }| of(path, Fault::Refused(what))))
             }
             Err(e) => bad.push(of(metadata::folder(store), Fault::Unreadable(e.to_string()))),
         }
-        Verified { n_files: self.n_files(), len_bytes: bytes_read.into_inner(), bad }
+        Verified { n_files: listing.len(), len_bytes: bytes_read.into_inner(), bad }
     }
 }
 

@@ -86,7 +86,7 @@ impl Walk<'_> {
         let (mut trusted, mut expected) = (None::<Trusted>, 1);
         for version in versions {
             if version != expected {
-                let _ = self.refuse(&missing(format!("{expected}.root.json")));
+                let _ = self.refuse(&format!("{expected}.root.json"), &missing("root"));
                 trusted = None;
             }
             expected = version.saturating_add(1);
@@ -95,10 +95,10 @@ impl Walk<'_> {
                 Some(mut before) => before.add_root(bytes).map(|()| before),
                 None => Trusted::new(bytes, now_unix_secs),
             });
-            trusted = followed.map_err(|cause| self.refuse(&At { name, cause })).ok();
+            trusted = followed.map_err(|cause| self.refuse(&name, &cause)).ok();
         }
         if expected == 1 {
-            let _ = self.refuse(&missing("1.root.json".into()));
+            let _ = self.refuse("1.root.json", &missing("root"));
         }
         trusted
     }
@@ -108,30 +108,33 @@ impl Walk<'_> {
         let root = trusted.root();
         let name = format!("{}.root.json", root.head.version);
         let is_current = root.check_expiry("root", trusted.now_unix_secs());
-        is_current.map_err(|cause| self.refuse(&At { name: name.clone(), cause }))?;
+        is_current.map_err(|cause| self.refuse(&name, &cause))?;
         self.step(TIMESTAMP_FILE.into(), |bytes| trusted.add_timestamp(bytes).map(drop))?;
         let stated = trusted.timestamp().map_or(0, |timestamp| timestamp.body.snapshot().version);
         self.step(format!("{stated}.snapshot.json"), |bytes| trusted.add_snapshot(bytes, None))?;
         let stated = trusted.snapshot().map_or(0, |snapshot| snapshot.body.meta["targets.json"].version);
         self.step(format!("{stated}.targets.json"), |bytes| trusted.add_targets(bytes))?;
-        let listed = trusted.target(TARGET).ok_or(TufError::Missing { what: TARGET.into() });
+        let listed = trusted.target(TARGET).ok_or(missing(TARGET));
         let checked = listed.and_then(|target| target.check(TARGET, manifest));
-        checked.map_err(|cause| self.refuse(&At { name: TARGET.into(), cause }))
+        checked.map_err(|cause| self.refuse(TARGET, &cause))
     }
 
     fn step(&mut self, name: String, add: impl FnOnce(&[u8]) -> Result<(), TufError>) -> Result<(), Ended> {
-        self.get(&name).and_then(add).map_err(|cause| self.refuse(&At { name, cause }))
+        self.get(&name).and_then(add).map_err(|cause| self.refuse(&name, &cause))
     }
 
     fn get(&self, name: &str) -> Result<&[u8], TufError> {
-        match self.metadata.get(name) {
-            Some(Ok(bytes)) => Ok(bytes),
-            Some(Err(cause)) => Err(cause.clone()),
-            None => Err(TufError::Missing { what: name.to_owned() }),
-        }
+        self.metadata.get(name).map_or_else(
+            || Err(missing(name)),
+            |read| match read {
+                Ok(bytes) => Ok(&bytes[..]),
+                Err(cause) => Err(cause.clone()),
+            },
+        )
     }
 
-    fn refuse(&mut self, At { name, cause }: &At) -> Ended {
+    /// `name`: of a metadata file, or the manifest's.
+    fn refuse(&mut self, name: &str, cause: &TufError) -> Ended {
         let fault = metadata_fault(cause);
         let refused = if name == TARGET {
             let path = self.store.join(files::MANIFEST);
@@ -150,12 +153,6 @@ impl Walk<'_> {
     }
 }
 
-/// A metadata file or the manifest, and why it is refused.
-struct At {
-    name: String,
-    cause: TufError,
-}
-
-fn missing(name: String) -> At {
-    At { cause: TufError::Missing { what: name.clone() }, name }
+fn missing(what: &str) -> TufError {
+    TufError::Missing { what: what.to_owned() }
 }

@@ -47,7 +47,7 @@ fn what_robots_would_refuse_is_told() {
             damage(path);
             let case = format!("{}, damage {number}", path.display());
             let reader = StoreReader::open(sound.path()).expect("published");
-            let bad = reader.listing().verify(|| {}).bad;
+            let bad = reader.verify(|| {}).bad;
             assert_eq!(bad.len(), 1, "{case}: {bad:?}");
             // A missing newest root shows in what its keys signed.
             let is_gone_root = number == 0 && path.ends_with("2.root.json");

@@ -4,8 +4,8 @@ use bytemuck::Zeroable;
 use slag_raster::constants::TILE_SIZE_PX;
 use wgpu::BufferUsages as Usage;
 
-use super::buffers::{Buffers, COUNTERS_BYTES, Size, VIEW_BYTES, regions_bytes};
 use super::device::Device;
+use super::jobs::{Buffers, COUNTERS_BYTES, Size, VIEW_BYTES, regions_bytes};
 use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
 use super::layout::{Background, Capacities, RegionSum, ViewBlock};
 use super::shader::{Counter, Counts};
@@ -67,9 +67,8 @@ impl Workspace {
         let device = band.device;
         self.set_region_bits(device, bits_of(n_regions));
         let mut encoder = self.bin(band, regions)?;
-        let [columns, rows] = band.tiles();
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        self.stages.blend(device, &mut pass, (columns, rows));
+        self.stages.blend(device, &mut pass, band.tiles());
         drop(pass);
         let mut pass = encoder.begin_compute_pass(&Default::default());
         let bits = bits_of(self.capacities.visible) + self.region_bits;
@@ -112,7 +111,6 @@ impl Workspace {
     ) -> Result<(Counts, Vec<f32>), RasterError> {
         let device = band.device;
         let mut encoder = self.bin(band, &[])?;
-        let [columns, rows] = band.tiles();
         let n_bytes = u64::from(self.n_px) * PIXEL_BYTES;
         let no_memory = || device.capacity_error("out of memory for a picture".into());
         let make = |label: &str, size, usage| device.buffer(label, size, usage).ok_or_else(no_memory);
@@ -134,7 +132,7 @@ impl Workspace {
         .map(whole);
         let kernel = &device.kernels.draw;
         let group = bind(device, kernel, &number(&bound));
-        dispatch(&mut encoder.begin_compute_pass(&Default::default()), kernel, &group, [columns, rows]);
+        dispatch(&mut encoder.begin_compute_pass(&Default::default()), kernel, &group, band.tiles());
         encoder.copy_buffer_to_buffer(&self.stages.buffers.counters, 0, &staging, 0, COUNTERS_BYTES);
         encoder.copy_buffer_to_buffer(&pixels, 0, &staging, COUNTERS_BYTES, n_bytes);
         let submission = device.queue.submit([encoder.finish()]);
@@ -181,19 +179,20 @@ impl Workspace {
         self.upload(&mut encoder, band, regions)?;
         encoder.clear_buffer(&self.stages.buffers.counters, 0, None);
         encoder.clear_buffer(&self.stages.buffers.ranges, 0, None);
+        let record = |encoder: &mut wgpu::CommandEncoder, chunk, gaussians: &wgpu::Buffer| {
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            self.stages.project(device, &mut pass, chunk, gaussians);
+        };
         for (index, chunk) in chunks.iter().enumerate() {
-            match &chunk.gaussians {
-                Some(gaussians) => self.project(device, &mut encoder, chunk, gaussians),
-                None => {
-                    let gaussians = upload(index)?;
-                    self.project(device, &mut encoder, chunk, &gaussians);
-                    // Waits before the next upload, so that at most one such chunk is on the device.
-                    let next = device.device.create_command_encoder(&Default::default());
-                    let full = std::mem::replace(&mut encoder, next);
-                    let submission = device.queue.submit([full.finish()]);
-                    device.wait(submission)?;
-                }
+            if let Some(gaussians) = &chunk.gaussians {
+                record(&mut encoder, chunk, gaussians);
+                continue;
             }
+            record(&mut encoder, chunk, &upload(index)?);
+            // Waits before the next upload, so that at most one such chunk is on the device.
+            let next = device.device.create_command_encoder(&Default::default());
+            let full = std::mem::replace(&mut encoder, next);
+            device.wait(device.queue.submit([full.finish()]))?;
         }
         let [columns, rows] = band.tiles();
         let mut pass = encoder.begin_compute_pass(&Default::default());
@@ -212,15 +211,10 @@ impl Workspace {
     }
 
     fn copy_back(&self, encoder: &mut wgpu::CommandEncoder) {
-        let contribution_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
-        encoder.copy_buffer_to_buffer(&self.stages.buffers.counters, 0, &self.staging, 0, COUNTERS_BYTES);
-        encoder.copy_buffer_to_buffer(
-            &self.stages.buffers.region_sums,
-            0,
-            &self.staging,
-            COUNTERS_BYTES,
-            contribution_bytes,
-        );
+        let n_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
+        let Buffers { counters, region_sums, .. } = &self.stages.buffers;
+        encoder.copy_buffer_to_buffer(counters, 0, &self.staging, 0, COUNTERS_BYTES);
+        encoder.copy_buffer_to_buffer(region_sums, 0, &self.staging, COUNTERS_BYTES, n_bytes);
     }
 
     fn read_back(
@@ -242,17 +236,6 @@ impl Workspace {
         drop(bytes);
         self.staging.unmap();
         Ok(counts)
-    }
-
-    fn project(
-        &self,
-        device: &Device,
-        encoder: &mut wgpu::CommandEncoder,
-        chunk: &SceneChunk,
-        gaussians: &wgpu::Buffer,
-    ) {
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        self.stages.project(device, &mut pass, chunk, gaussians);
     }
 }
 
@@ -313,10 +296,8 @@ mod tests {
     /// 40 blocks of 2^27 pairs exceed 2^32: the total saturates at the largest number, which no buffer holds.
     #[test]
     fn counts_that_would_wrap_stay_at_the_largest() {
-        let Some((device, mut workspace)) = opened(Capacities { visible: 10_000, pairs: 1, entries: 1 })
-        else {
-            return;
-        };
+        let counts = Capacities { visible: 10_000, pairs: 1, entries: 1 };
+        let Some((device, workspace)) = opened(counts) else { return };
         for (of_block, expected) in [(1 << 20, 40 << 20), (1 << 27, u32::MAX)] {
             let Buffers { counters, block_counts, .. } = &workspace.stages.buffers;
             let mut counts: Counts = Zeroable::zeroed();
@@ -337,10 +318,8 @@ mod tests {
     /// repeat, which reveals an unstable sort.
     #[test]
     fn the_sort_is_stable_at_every_size() {
-        let Some((device, mut workspace)) = opened(Capacities { visible: 1, pairs: 1, entries: 70_000 })
-        else {
-            return;
-        };
+        let counts = Capacities { visible: 1, pairs: 1, entries: 70_000 };
+        let Some((device, mut workspace)) = opened(counts) else { return };
         workspace.set_region_bits(&device, bits_of(300));
         for n in [0, 1, 2, 255, 256, 257, 2047, 2048, 2049, 4096, 70_000] {
             let key = |i: u32, salt: u32| (i ^ salt).wrapping_mul(0x9e37_79b9) >> 8;
