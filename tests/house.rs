@@ -7,7 +7,7 @@ use half::f16;
 use serde_json::Value;
 use slag_common::npy::Npz;
 use slag_common::shard::Profile;
-use slag_encoder::lift::published::{read_field, read_regions};
+use slag_encoder::lift::field::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 

@@ -8,7 +8,7 @@ use slag_common::manifest::{Calibration, CellRecord};
 use slag_common::objects::object_score;
 use slag_common::shard::Profile;
 
-use crate::lift::published::{ReadFieldError, read_field, read_regions};
+use crate::lift::field::{ReadFieldError, read_field, read_regions};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader, StoredShard};
 pub(crate) use hits::points_ply;

@@ -8,10 +8,10 @@ use image::GrayImage;
 use slag_common::poses::SplatFrame;
 use slag_common::{Gaussians, Similarity, View, durable, files, poses, splat};
 
+use super::common;
 use super::common::{Exit, InputArgs, print};
 use super::memory::free_memory_bytes;
 use super::next;
-use super::outputs;
 use crate::check::{
     self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Suspicion,
 };
@@ -56,7 +56,7 @@ pub struct CheckArgs {
 pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     let mut read = args.input.paths_read();
     read.extend(args.also_poses.as_deref());
-    outputs::check(args.write_frame.as_deref(), &read, None)?;
+    common::check(args.write_frame.as_deref(), &read, None)?;
     let inputs = Inputs::read(args)?;
     let (report, is_partial) = checked(args, inputs)?;
     let next = if report.diagnosis.is_none() { next::of_check(&args.input) } else { String::new() };

@@ -13,6 +13,7 @@ use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
 use super::choices::ChoiceArgs;
+use super::common;
 use super::common::{
     Exit, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
     parse_secs, print, profile_parser, warn_of_expiry,
@@ -20,7 +21,6 @@ use super::common::{
 use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
 use super::next;
-use super::outputs;
 use super::summary::lines;
 use crate::cells::PositionError;
 use crate::encode::front::{Expectation, Front, Target};
@@ -317,7 +317,7 @@ fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expe
 }
 
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    outputs::check(args.report.as_deref(), &args.paths_read(), Some(&args.store))?;
+    common::check(args.report.as_deref(), &args.paths_read(), Some(&args.store))?;
     args.report.iter().try_for_each(|path| files::check_writable(path))?;
     let (mut settings, expected) = settings_and_target(args)?;
     let (models, session) = open_models(&args.models)?;

@@ -12,8 +12,8 @@ use slag_common::splat::{self, ReadOptions, ply};
 use slag_common::{Gaussians, durable, files, npy};
 use slag_models::words_to_find;
 
+use super::common;
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
-use super::outputs;
 use crate::query::{self, Hit};
 use crate::store::StoreReader;
 use crate::view::{Found, Things};
@@ -59,7 +59,7 @@ pub struct QueryArgs {
 pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let outputs = args.scores.iter().chain(&args.ply).map(PathBuf::as_path);
     let read: Vec<&Path> = args.scene.iter().chain(&args.models.models).map(PathBuf::as_path).collect();
-    outputs::check(outputs, &read, Some(&args.store))?;
+    common::check(outputs, &read, Some(&args.store))?;
     args.scores.iter().chain(&args.ply).try_for_each(|path| files::check_writable(path))?;
     let reader = StoreReader::open(&args.store)?;
     let manifest = reader.manifest();

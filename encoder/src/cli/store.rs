@@ -10,8 +10,8 @@ use slag_common::Hash32;
 use slag_common::byte_size::ByteSize;
 use slag_common::tuf::format_utc;
 
+use super::common;
 use super::common::{Exit, print, warn_of_expiry};
-use super::outputs;
 use crate::encode::{JobStatus, job_status};
 use crate::progress::Progress;
 use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, signing_unix_secs};
@@ -101,7 +101,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             Ok(Exit::Done)
         }
         StoreCommand::Export { at, out } => {
-            outputs::check([out.as_path()], &[], Some(&at.store))?;
+            common::check([out.as_path()], &[], Some(&at.store))?;
             let exported = export(&at.store, out)?;
             let Exported { n_files, len_bytes, n_removed } = exported;
             let lines = format!("{n_files} objects written, {}; {n_removed} removed\n", ByteSize(len_bytes));

@@ -8,8 +8,6 @@
 
 pub mod basis;
 pub mod cluster;
-mod compare;
-mod fine;
 pub mod measure;
 mod outliers;
 pub(crate) mod residual;
@@ -20,13 +18,13 @@ use slag_common::shard::{self, ScoreErrors};
 
 use basis::{Basis, MAX_COMPONENTS};
 use cluster::{Clusters, Members};
-use compare::{Decoder, Reference};
 use measure::ScoreMoments;
+use measure::{Decoder, Reference};
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 
 pub use basis::{ScoreMetric, TextBank};
-pub(crate) use fine::FineResiduals;
+pub(crate) use residual::FineResiduals;
 
 /// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled
 /// house, whose errors have heavy tails; 1.25 for normally distributed errors.
@@ -315,7 +313,7 @@ fn code_residuals(
     let (m, ranges, members) = (fitted.n_components, &stored.ranges, reference.members);
     let residuals = residuals_of_stored(reference, fitted, &scales);
     let fine = has_fine.then(|| {
-        let (fine, decoded) = fine::round(&residuals, m, &members.starts, &scales, ranges);
+        let (fine, decoded) = residual::round(&residuals, m, &members.starts, &scales, ranges);
         let (_, errors) = reference.compare(Some((&stored.decoder(m), &decoded)));
         FineResiduals { errors, ..fine }
     });

@@ -23,8 +23,8 @@ use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::ingest;
 use crate::lanes::Lanes;
+use crate::lift::field::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
 use crate::lift::photos::{self, Photo};
-use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
 use crate::lift::refine::{PendingRefinement, Refinement};
 use crate::lift::{
     Aggregation, CellField, ContributionError, ContributionIndex, PartContributions, RegionTable,

@@ -9,7 +9,6 @@ mod cells;
 mod context;
 pub mod coverage;
 mod error;
-mod executor;
 pub mod front;
 mod identity;
 mod inputs;
@@ -30,7 +29,7 @@ use crate::memory::Phase;
 use crate::progress::Progress;
 use crate::store::{Store, StoreError};
 use context::RunContext;
-use executor::Executor;
+use views::Executor;
 
 pub use context::Engines;
 pub(crate) use error::EncodeError;
@@ -49,11 +48,11 @@ pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, Restart,
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet_parts {
     pub(crate) use super::context::RunContext;
-    pub(crate) use super::executor::{Executor, ViewsRun, work_off};
     pub(crate) use super::identity::{OF_A_FLEET, of_scene};
     pub(crate) use super::plan::{Plan, segmenter_of};
     pub(crate) use super::report::LeftOut;
     pub(crate) use super::view::{PhotoSource, ViewRecord, ViewSink, ViewStages, ViewTools};
+    pub(crate) use super::views::{Executor, ViewsRun, work_off};
 }
 
 /// Encodes a scene into a store and publishes it as the next generation.
@@ -66,7 +65,7 @@ pub fn encode(
     progress: &dyn Progress,
     cancel: &AtomicBool,
 ) -> Result<EncodeSummary, EncodeError> {
-    encode_by(&executor::Here, settings, engines, progress, cancel)
+    encode_by(&views::Here, settings, engines, progress, cancel)
 }
 
 /// Like [`encode`]; `executor` does the views.

@@ -13,11 +13,11 @@ use slag_models::ModelDir;
 
 use super::cells::{BuiltCells, Counts};
 use super::error::EncodeError;
-use super::executor::Executor;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary, LeftOut};
 use super::settings::Masks;
 use super::views::DoneViews;
+use super::views::Executor;
 use crate::store::{ModelsRecord, Store};
 
 /// Publishes the built cells, ends the job and returns the summary.

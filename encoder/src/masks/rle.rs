@@ -6,7 +6,7 @@
 
 use serde::Serialize;
 
-use super::bits::Bits;
+use super::mask::Bits;
 use super::mask::{BoxPx, Mask};
 
 /// Most digits of a signed 32-bit number, at 5 bits per digit.

@@ -11,7 +11,7 @@ use super::choice::{self, Sizes};
 use super::object::{NONE, Object, ObjectsReport, SceneObjects};
 use super::sightings::Sightings;
 use super::tree::Tree;
-use super::{near, object, tree};
+use super::{object, tree};
 use crate::codebook::ScoreMetricContext;
 use crate::lift::photos::MaskOutline;
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
@@ -37,7 +37,7 @@ pub(crate) fn find(
         None => Cow::Owned(Superpoints::new(scene.gaussians, scene.standing, &SuperpointSettings::default())),
     };
     let sightings = Sightings::gather(scene, table, &superpoints)?;
-    let pairs = tree::evidence_of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
+    let pairs = tree::evidence_of_pairs(&sightings, &tree::pairs(scene.gaussians, &superpoints));
     scene.check_cancelled()?;
     let tree = Tree::new(superpoints.n, &pairs);
     drop(pairs);

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::occupancy::BLOCK_EDGE;
 
-use super::lattice::{BlockAt, Lattice};
+use super::owners::{BlockAt, Lattice};
 
 /// Opacity from which a voxel is occupied (splat-transform's, for voxels of 5 cm).
 pub const MIN_OPACITY: f32 = 0.1;

@@ -1,7 +1,6 @@
 //! Which places are free, occupied or unknown, for robots that move. The definition is in `docs/numerics.md`.
 
 mod density;
-mod lattice;
 mod owners;
 mod seen;
 
@@ -14,7 +13,7 @@ use slag_common::{Gaussians, View};
 use crate::cells::{CellSplit, NO_CELL};
 use crate::memory::{MemoryError, MemoryPlan, Phase};
 use crate::raster::{LoadedScene, RasterError, RasterView};
-use lattice::Lattice;
+use owners::Lattice;
 use seen::Candidate;
 
 pub use density::MIN_OPACITY;

@@ -3,8 +3,6 @@
 //! [`CpuRasterizer`] is the reference; its stages up to blending are [`slag_raster`]'s. On GPUs every stage is a
 //! shader. `contributions` sums weights per (Gaussian, region).
 
-mod adapter;
-mod contributions;
 mod cpu;
 pub mod devices;
 #[cfg(feature = "gpu")]

@@ -4,8 +4,8 @@ use std::convert::Infallible;
 
 use slag_common::Gaussians;
 
-pub(crate) use super::adapter::AdapterReport;
-pub use super::adapter::{GpuOptions, Precision};
+pub(crate) use super::rasterizer::AdapterReport;
+pub use super::rasterizer::{GpuOptions, Precision};
 use super::rasterizer::{LoadedScene, RasterError, Rasterizer};
 
 pub struct Adapter {

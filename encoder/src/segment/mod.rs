@@ -1,12 +1,10 @@
 //! Segmentation: finds the masks of a photo.
 
-mod colour;
 mod given;
 mod graph;
 mod sam;
 mod segmenter;
 mod standing;
-mod support;
 
 pub use given::{GivenMasks, file_of as mask_file};
 pub use graph::{GraphSegmenter, GraphSettings};

@@ -19,7 +19,7 @@ use super::error::StoreError;
 use super::files;
 use super::metadata::clock_unix_secs;
 use super::reader::{Published, StoreReader};
-use super::walk::{self, Refused};
+use super::verify::{self, Refused};
 
 const FIRST_ROOT: &str = "1.root.json";
 
@@ -41,18 +41,18 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     let mut n_tries = 0;
     let (reader, metadata) = loop {
         let reader = StoreReader::open(store)?;
-        let metadata = walk::read_all(store)?;
+        let metadata = verify::read_all(store)?;
         // The manifest is published before the metadata that names it.
         if !reader.is_current() {
             continue;
         }
-        let refused = walk::refused_of(store, &metadata, &reader.current().bytes, clock_unix_secs());
+        let refused = verify::refused_of(store, &metadata, &reader.current().bytes, clock_unix_secs());
         let Some(Refused { path, what }) = refused.into_iter().next() else { break (reader, metadata) };
         n_tries += 1;
-        if n_tries == walk::N_TRIES {
+        if n_tries == verify::N_TRIES {
             return Err(StoreError::Refused { path, what });
         }
-        std::thread::sleep(walk::PAUSE);
+        std::thread::sleep(verify::PAUSE);
     };
     let folder = to.join("v1");
     let [objects, targets, of_metadata] = ["objects", "targets", "metadata"].map(|name| folder.join(name));

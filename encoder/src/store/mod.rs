@@ -35,7 +35,6 @@ mod roles;
 #[cfg(test)]
 pub(crate) mod tests;
 mod verify;
-mod walk;
 #[cfg(test)]
 mod walk_tests;
 mod writer;

@@ -15,10 +15,11 @@
 //! refinement; [`PendingRefinement::finish`] returns the table with the mixtures. Decisions are made in principal
 //! coordinates of the mask vectors (`points`) and in one order: the result depends neither on threads nor on memory.
 
-mod mixture;
-mod prune;
-mod settings;
+use std::ops::Range;
 
+use mixture::{AXES, Mixtures, PartSums, Point, SuperpointSums};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use slag_math::axes::principal_coordinates;
 
 use super::contributions::ContributionError;
@@ -29,8 +30,8 @@ use super::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Supe
 use super::table::RegionTable;
 use crate::masks::Mask;
 use crate::memory::{self, MemoryPlan, Phase};
-use mixture::{AXES, Mixtures, PartSums, Point, SuperpointSums};
-pub use settings::Aggregation;
+
+mod mixture;
 
 /// Least base of a mask's weight: even a mask that is wholly cut off gives evidence.
 const LEAST_MASK_WEIGHT: f32 = 0.01;
@@ -246,8 +247,137 @@ impl Refinement {
     }
 
     fn prune(&self, contributions: &mut PartContributions) {
-        prune::prune(contributions, self.settings.min_view_share, &self.first_regions, &self.mask_counts);
+        prune(contributions, self.settings.min_view_share, &self.first_regions, &self.mask_counts);
     }
+}
+
+/// How the contributions of all views become embeddings. The default is the paper's weighted average.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Aggregation {
+    /// Drops views in which a Gaussian has less than this share of its weight in its best view, 0..=1.
+    pub(crate) min_view_share: f32,
+    /// Each mask counts (1 - truncation)^`truncation_power`. A mask's truncation is the share of its outline that
+    /// the photo's edge cuts off.
+    pub(crate) truncation_power: f32,
+    /// Weight of the superpoint's mean, relative to the Gaussian's own.
+    pub(crate) superpoint: f32,
+    /// Weight of the larger superpoint's mean, relative to the result so far.
+    pub coarse: f32,
+    /// Weight of the mean of the Gaussian's object, relative to the result so far.
+    pub object: f32,
+    /// Whether Gaussians without evidence take their superpoint's mean.
+    pub fill: bool,
+}
+
+impl Aggregation {
+    /// The paper's weighted average.
+    pub const PLAIN: Self = Self {
+        min_view_share: 0.0,
+        truncation_power: 0.0,
+        superpoint: 0.0,
+        coarse: 0.0,
+        object: 0.0,
+        fill: false,
+    };
+    /// The refinements that help on both trained and generated splats (docs/decisions.md). Larger shares of superpoints
+    /// smooth small things away.
+    pub(crate) const REFINED: Self = Self {
+        min_view_share: 0.05,
+        truncation_power: 2.0,
+        superpoint: 1.5,
+        coarse: 0.5,
+        object: 0.25,
+        fill: true,
+    };
+
+    pub(crate) fn has_fine_superpoints(&self) -> bool {
+        self.superpoint > 0.0 || self.fill
+    }
+
+    pub(super) fn needs_superpoints(&self) -> bool {
+        self.has_fine_superpoints() || self.coarse > 0.0
+    }
+
+    /// Gaussians share evidence, so vectors are needed in principal coordinates.
+    pub(super) fn needs_mixtures(&self) -> bool {
+        self.needs_superpoints() || self.object > 0.0
+    }
+
+    /// Partitions within which Gaussians share evidence.
+    pub(super) fn n_partitions(&self) -> usize {
+        self.n_scales() + usize::from(self.object > 0.0)
+    }
+
+    pub(super) fn n_scales(&self) -> usize {
+        usize::from(self.has_fine_superpoints()) + usize::from(self.coarse > 0.0)
+    }
+}
+
+/// Least number of Gaussians per task.
+const CHUNK: usize = 4096;
+
+struct ViewEntries {
+    entries: Range<usize>,
+    weight: f32,
+}
+
+/// Splits a Gaussian's entries, ascending by region, by view. `first_regions`: of each view, ascending.
+fn by_view(
+    contributions: &PartContributions,
+    entries: Range<usize>,
+    first_regions: &[u32],
+) -> Vec<ViewEntries> {
+    let mut views: Vec<ViewEntries> = Vec::new();
+    let mut end_region = 0;
+    for entry in entries {
+        let region = contributions.regions[entry];
+        if views.is_empty() || region >= end_region {
+            let next = first_regions.partition_point(|first| *first <= region);
+            end_region = first_regions.get(next).copied().unwrap_or(u32::MAX);
+            views.push(ViewEntries { entries: entry..entry, weight: 0.0 });
+        }
+        if let Some(view) = views.last_mut() {
+            view.entries.end = entry + 1;
+            view.weight += contributions.weights[entry];
+        }
+    }
+    views
+}
+
+/// Drops entries of views where a Gaussian has less than `min_view_share` of its weight in its best view.
+/// `mask_counts`: `[n_regions]`, summed weight of the region's masks.
+pub(super) fn prune(
+    contributions: &mut PartContributions,
+    min_view_share: f32,
+    first_regions: &[u32],
+    mask_counts: &[f32],
+) {
+    if min_view_share <= 0.0 {
+        return;
+    }
+    let kept_of = |k: usize| -> Vec<Range<usize>> {
+        let views = by_view(contributions, contributions.entries_of(k), first_regions);
+        let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
+        let seen = views.into_iter().filter(|view| view.weight >= min_view_share * best);
+        seen.map(|view| view.entries).collect()
+    };
+    let n = contributions.total_weights.len();
+    let kept: Vec<Vec<Range<usize>>> = (0..n).into_par_iter().with_min_len(CHUNK).map(kept_of).collect();
+    let mut at = 0;
+    for (k, kept) in kept.into_iter().enumerate() {
+        let mut total = 0.0;
+        for entry in kept.into_iter().flatten() {
+            let (region, weight) = (contributions.regions[entry], contributions.weights[entry]);
+            (contributions.regions[at], contributions.weights[at]) = (region, weight);
+            total += f64::from(weight) * f64::from(mask_counts[region as usize]);
+            at += 1;
+        }
+        contributions.starts[k + 1] = at as u64;
+        contributions.total_weights[k] = total as f32;
+    }
+    contributions.regions.truncate(at);
+    contributions.weights.truncate(at);
 }
 
 #[cfg(test)]

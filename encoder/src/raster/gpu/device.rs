@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use pollster::block_on;
 
 use super::shader::Kernels;
-use crate::raster::adapter::{AdapterReport, Precision};
 use crate::raster::rasterizer::RasterError;
+use crate::raster::rasterizer::{AdapterReport, Precision};
 
 fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
     let info = adapter.get_info();

@@ -1,7 +1,7 @@
 //! Run-length masks of JSON files: SAM's lists and COCO data sets.
 
 use std::collections::BTreeMap;
-use std::io::Read;
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use serde::Deserialize;
@@ -227,4 +227,77 @@ pub(super) fn check_size(
     }
     let view = input.view.name.clone();
     Err(SegmentError::Size { path: path.to_owned(), view, found_px: [width, height], expected_px })
+}
+
+/// Memory for the PNG decoder beside the pixels.
+const PNG_OVERHEAD_BYTES: usize = 1 << 20;
+
+/// Least number of values between black and white in a single mask with soft edges.
+const MIN_SOFT: usize = 8;
+const WHITE: u32 = 255;
+
+/// Number of values between black and white in a mask with antialiased edges; `None` for ids, which have pixels whose
+/// neighbours all have the same id.
+pub(super) fn n_soft(ids: &[u32], width: usize) -> Option<usize> {
+    let mut is_found = [false; WHITE as usize + 1];
+    ids.iter().for_each(|id| is_found[(*id).min(WHITE) as usize] = true);
+    let n = is_found[1..WHITE as usize].iter().filter(|is_found| **is_found).count();
+    let has_white_alone = is_found[0] && ids.iter().max() == Some(&WHITE);
+    if n < MIN_SOFT || !has_white_alone {
+        return None;
+    }
+    let between = || ids.iter().enumerate().filter(|(_, id)| (1..WHITE).contains(*id));
+    let is_inside = |(at, id): &(usize, &u32)| {
+        let neighbours = [at.wrapping_sub(width), at.wrapping_sub(1), at + 1, at + width];
+        neighbours.iter().all(|at| ids.get(*at) == Some(*id))
+    };
+    // The tails of a blur are flat here and there.
+    (10 * between().filter(is_inside).count() < between().count()).then_some(n)
+}
+
+/// Ids of a PNG of the photo's size, row-major; of a palette, the indices.
+pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>, SegmentError> {
+    let failed = |source| SegmentError::Png { path: path.to_owned(), source };
+    let n_pixels = input.image.width() as usize * input.image.height() as usize;
+    let limits = png::Limits { bytes: 2 * n_pixels + PNG_OVERHEAD_BYTES };
+    let mut file = BufReader::new(files::open(path)?);
+    if let Some((what, advice)) = files::stand_in(file.fill_buf()?) {
+        return Err(SegmentError::StandIn { path: path.to_owned(), what, advice });
+    }
+    let mut decoder = png::Decoder::new_with_limits(file, limits);
+    decoder.set_transformations(png::Transformations::IDENTITY);
+    let (width_px, height_px) = decoder.read_header_info().map_err(failed)?.size();
+    check_size(path, [width_px, height_px], input)?;
+    let mut reader = decoder.read_info().map_err(failed)?;
+    let (color, depth) = reader.output_color_type();
+    let found = match color {
+        png::ColorType::Grayscale | png::ColorType::Indexed => None,
+        png::ColorType::Rgb => Some("RGB"),
+        png::ColorType::GrayscaleAlpha => Some("gray and alpha"),
+        png::ColorType::Rgba => Some("RGBA"),
+    };
+    if let Some(found) = found {
+        return Err(SegmentError::NotIds { path: path.to_owned(), found });
+    }
+    // Bounded: at most 16 bits per pixel of the photo's size.
+    let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(0)];
+    let frame = reader.next_frame(&mut bytes).map_err(failed)?;
+    check_size(path, [frame.width, frame.height], input)?;
+
+    let mut ids = Vec::with_capacity(n_pixels);
+    let bits = depth as usize;
+    for row in bytes.chunks_exact(frame.line_size.max(1)).take(height_px as usize) {
+        match bits {
+            16 => {
+                ids.extend(row.chunks_exact(2).map(|pair| u32::from(u16::from_be_bytes([pair[0], pair[1]]))))
+            }
+            8 => ids.extend(row.iter().map(|byte| u32::from(*byte))),
+            // Several pixels per byte, the leftmost in the highest bits; each row starts at a byte.
+            _ => ids.extend((0..width_px as usize).map(|x| {
+                let shift = 8 - bits - x * bits % 8;
+                u32::from(row[x * bits / 8] >> shift) & ((1 << bits) - 1)
+            })),
+        }
+    }
+    Ok(ids)
 }

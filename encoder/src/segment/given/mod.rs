@@ -1,7 +1,6 @@
 //! Masks from files: id images, SAM's lists of run-length masks, COCO data sets.
 
 mod coco;
-mod id_image;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -130,8 +129,8 @@ impl GivenMasks {
         input: &SegmentInput<'_>,
         is_binary: bool,
     ) -> Result<Vec<Mask>, SegmentError> {
-        let mut labels = id_image::read_ids(path, input)?;
-        if let (false, Some(n)) = (is_binary, id_image::n_soft(&labels, input.image.width() as usize)) {
+        let mut labels = coco::read_ids(path, input)?;
+        if let (false, Some(n)) = (is_binary, coco::n_soft(&labels, input.image.width() as usize)) {
             return Err(SegmentError::SoftEdges { path: path.to_owned(), n });
         }
         // Soft edges are cut at half.

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 use slag_models::sam::{Decoded, MASKS_PER_PROMPT};
 
 use super::runs::RunMask;
-use super::settings::{SamSettings, ScoreFilter};
 use super::upsample::Upsampler;
+use super::{SamSettings, ScoreFilter};
 use crate::masks::BoxPx;
 
 /// A box this near to an edge touches it, as in the reference implementation.

@@ -6,29 +6,23 @@
 //! once per image and crop, the decoder once per batch of points. While it decodes a batch, the masks of the
 //! previous batch are enlarged and filtered in parallel.
 
-mod filter;
-mod points;
-mod runs;
-mod settings;
-#[cfg(test)]
-mod tests;
-mod upsample;
-
 use std::panic::resume_unwind;
 use std::path::Path;
 use std::sync::{Arc, mpsc};
 
+use filter::{Candidate, Filters};
 use image::imageops;
 use slag_models::sam::{Decoded, Sam};
 use slag_models::{ModelError, SessionOptions};
+use upsample::Upsampler;
 
 use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::lanes::{GpuLoad, Lanes};
 use crate::masks::{BoxPx, Mask};
-use filter::{Candidate, Filters};
-use upsample::Upsampler;
 
-pub use settings::{SamLevels, SamSettings, ScoreFilter};
+mod filter;
+mod runs;
+mod upsample;
 
 /// While the masks of some photos are filtered, the GPU has others.
 const MODELS_PER_GPU: usize = 2;
@@ -90,7 +84,7 @@ impl SamSegmenter {
         let embedding = sam.embed(&cropped)?;
         let SamSettings { points_per_side, points_per_batch, crop_points_divisor, .. } = self.settings;
         let n_per_side = (points_per_side / crop_points_divisor.saturating_pow(layer)).max(1);
-        let points = points::grid(n_per_side, width_px, height_px);
+        let points = grid(n_per_side, width_px, height_px);
         let points: Vec<[f32; 2]> =
             points.into_iter().map(|point| embedding.letterbox.point(point)).collect();
         let labels = vec![1; points_per_batch as usize];
@@ -148,7 +142,7 @@ impl Segmenter for SamSegmenter {
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
         let (width_px, height_px) = input.image.dimensions();
         let filters = Filters { settings: &self.settings, image_px: [width_px, height_px] };
-        let crops = points::crops(width_px, height_px, self.settings.crop_layers, self.settings.crop_overlap);
+        let crops = crops(width_px, height_px, self.settings.crop_layers, self.settings.crop_overlap);
         let mut found = vec![Vec::new(); self.settings.levels.lists().len()];
         let mut left_bytes = MAX_MASK_BYTES;
         let sam = self.lanes.take();
@@ -166,5 +160,173 @@ impl Segmenter for SamSegmenter {
             return Err(too_many(input));
         }
         Ok(kept.iter().map(|candidate| candidate.mask.to_mask(candidate.level)).collect())
+    }
+}
+
+/// Centres of `n_per_side` x `n_per_side` cells of an image, pixels, row by row.
+pub(super) fn grid(n_per_side: u32, width_px: u32, height_px: u32) -> Vec<[f64; 2]> {
+    let at = |i: u32, edge_px: u32| (f64::from(i) + 0.5) / f64::from(n_per_side) * f64::from(edge_px);
+    (0..n_per_side).flat_map(|y| (0..n_per_side).map(move |x| [at(x, width_px), at(y, height_px)])).collect()
+}
+
+/// Crops with their layers: the whole image as layer 0, and 2^i x 2^i crops for each further layer `i`. They overlap by
+/// `overlap_ratio` of the shorter edge in layer 1, half of that in each further layer.
+pub(super) fn crops(width_px: u32, height_px: u32, n_layers: u32, overlap_ratio: f64) -> Vec<(BoxPx, u32)> {
+    let mut crops = vec![(BoxPx { x0: 0, y0: 0, x1: width_px, y1: height_px }, 0)];
+    for layer in 1..=n_layers {
+        let n = 1_u32 << layer;
+        let overlap_px = (overlap_ratio * f64::from(width_px.min(height_px)) * (2.0 / f64::from(n))) as u32;
+        let len = |edge_px: u32| (overlap_px * (n - 1) + edge_px).div_ceil(n);
+        let (width, height) = (len(width_px), len(height_px));
+        for i in 0..n * n {
+            let (x0, y0) = ((width - overlap_px) * (i / n), (height - overlap_px) * (i % n));
+            let crop = BoxPx { x0, y0, x1: (x0 + width).min(width_px), y1: (y0 + height).min(height_px) };
+            // In tiny images, crops at the right and bottom may be empty.
+            if x0 < crop.x1 && y0 < crop.y1 {
+                crops.push((crop, layer));
+            }
+        }
+    }
+    crops
+}
+
+/// Which of the three masks of a prompt are used.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, clap::ValueEnum,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum SamLevels {
+    /// All three in one list: a duplicate goes, whatever its level, as in the reference implementation.
+    #[default]
+    Merged,
+    /// The largest.
+    Whole,
+    Part,
+    /// The smallest.
+    Subpart,
+    /// All three, each level filtered by itself, as LangSplat does.
+    All,
+}
+
+impl SamLevels {
+    /// Levels of each separately filtered list: 0 whole, 1 part, 2 subpart.
+    pub(super) fn lists(self) -> &'static [&'static [u8]] {
+        match self {
+            Self::Merged => &[&[0, 1, 2]],
+            Self::Whole => &[&[0]],
+            Self::Part => &[&[1]],
+            Self::Subpart => &[&[2]],
+            Self::All => &[&[0], &[1], &[2]],
+        }
+    }
+}
+
+/// Thresholds of LangSplat's filter. A mask's score is its predicted IoU times its stability.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct ScoreFilter {
+    /// Masks need a score above this; where none has it, the best three stay.
+    pub min_score: f64,
+    /// A mask goes if its IoU with one of a higher score is above this.
+    pub max_iou: f64,
+    /// A mask of which at least 85 % lie in another one, of which it covers less than half, goes if the product of
+    /// the two shares is below this.
+    pub max_contained: f64,
+}
+
+impl ScoreFilter {
+    pub const LANGSPLAT: Self = Self { min_score: 0.7, max_iou: 0.8, max_contained: 0.5 };
+}
+
+/// Settings for the prompts and the filters of masks. The defaults are those of the reference implementation.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct SamSettings {
+    pub points_per_side: u32,
+    /// Points that the decoder processes at once. Memory: 0.8 MB per point, twice.
+    pub points_per_batch: u32,
+    /// Masks need a predicted IoU above this; 0 keeps all masks.
+    pub predicted_iou: f32,
+    /// Least IoU between the masks thresholded at logits of plus and minus `stability_offset`.
+    pub stability: f64,
+    /// Offset of the thresholds for `stability`, logits.
+    pub stability_offset: f32,
+    /// Of two masks in a crop with a box IoU above this, the one with the higher predicted IoU is kept.
+    pub box_nms_iou: f64,
+    /// The same for the pixel IoU of all masks, at the end; 1 compares none, like the reference implementation.
+    pub mask_nms_iou: f64,
+    /// Layers of crops in addition to the whole image; layer `i` has 4^i crops.
+    pub crop_layers: u32,
+    /// Of two masks in different crops with a box IoU above this, the one in the smaller crop is kept.
+    pub crop_nms_iou: f64,
+    /// Overlap of neighbouring crops of the first layer, relative to the shorter edge of the image.
+    pub crop_overlap: f64,
+    /// Divisor of the points per side from layer to layer.
+    pub crop_points_divisor: u32,
+    /// Which of the three masks of a prompt are used.
+    pub levels: SamLevels,
+    /// LangSplat's filter at the end, for each level by itself.
+    pub score_filter: Option<ScoreFilter>,
+    /// Holes are filled and islands removed if they have fewer pixels; 0 keeps all.
+    pub min_region_px: u32,
+}
+
+impl Default for SamSettings {
+    fn default() -> Self {
+        Self {
+            points_per_side: 32,
+            points_per_batch: 64,
+            predicted_iou: 0.88,
+            stability: 0.95,
+            stability_offset: 1.0,
+            box_nms_iou: 0.7,
+            mask_nms_iou: 1.0,
+            crop_layers: 0,
+            crop_nms_iou: 0.7,
+            crop_overlap: 512.0 / 1500.0,
+            crop_points_divisor: 1,
+            min_region_px: 0,
+            levels: SamLevels::Merged,
+            score_filter: None,
+        }
+    }
+}
+
+impl SamSettings {
+    /// The paper's: LangSplat's mask generator (Qin et al. 2024, `preprocess.py`) on a grid of 16 x 16 points, whole
+    /// level only.
+    pub fn paper() -> Self {
+        Self {
+            points_per_side: 16,
+            predicted_iou: 0.7,
+            stability: 0.85,
+            crop_layers: 1,
+            min_region_px: 100,
+            levels: SamLevels::Whole,
+            score_filter: Some(ScoreFilter::LANGSPLAT),
+            ..Self::default()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn grids_and_crops_are_those_of_the_reference() {
+        let four = grid(2, 640, 480);
+        assert_eq!(four, [[160.0, 120.0], [480.0, 120.0], [160.0, 360.0], [480.0, 360.0]]);
+        assert_eq!(grid(32, 1000, 700).len(), 1024);
+        // By hand: the overlap is int(512 / 1500 * 480 * 2 / 2) = 163 px, then 81 px; a crop is
+        // ceil((163 + 640) / 2) = 402 px wide and ceil((163 + 480) / 2) = 322 px high, then 221 and 181 px.
+        let crops = crops(640, 480, 2, 512.0 / 1500.0);
+        assert_eq!(crops.len(), 1 + 4 + 16);
+        let edges = |k: usize| (crops[k].1, crops[k].0.x0, crops[k].0.y0, crops[k].0.x1, crops[k].0.y1);
+        assert_eq!(edges(0), (0, 0, 0, 640, 480));
+        assert_eq!(
+            [1, 2, 3, 4].map(edges),
+            [(1, 0, 0, 402, 322), (1, 0, 159, 402, 480), (1, 239, 0, 640, 322), (1, 239, 159, 640, 480),]
+        );
+        assert_eq!(edges(5), (2, 0, 0, 221, 181));
+        assert_eq!(edges(20), (2, 420, 300, 640, 480));
     }
 }
