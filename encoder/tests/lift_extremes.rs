@@ -51,7 +51,7 @@ fn one_cell(
     let path = dir.path().join("view.contributions");
     view.write(&path).expect("writes");
     let (index, table) = ContributionIndex::open(&[path], DIM, &[input_indices.len()]).expect("opens");
-    assert_eq!(index.parts().len(), 1);
+    assert_eq!(index.parts.len(), 1);
     let raw = index.read(0..1).expect("reads");
     let contributions = index.transpose(&raw, &table).expect("transposes").remove(0);
     let mut embeddings = vec![f32::NAN; input_indices.len() * DIM];

@@ -97,7 +97,7 @@ pub(super) fn build_cells(
     };
     // Before refinement adds superpoints as regions.
     let counts = Counts {
-        n_views_without_masks: index.n_masks_of_view().filter(|n| *n == 0).count(),
+        n_views_without_masks: index.views.iter().filter(|view| view.n_masks == 0).count(),
         n_masks: table.n_masks(),
         n_regions: table.len(),
         n_entries: index.n_entries(),
@@ -126,7 +126,7 @@ pub(super) fn build_cells(
     let finished = maker.build(&index, budget)?;
     plan.context.progress.end();
     let mut n_entries = vec![0; inputs.split.cells.len()];
-    index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
+    index.parts.iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
     let mut built = BuiltCells {
         records: Vec::new(),
         n_subspaces: Vec::new(),
@@ -225,9 +225,9 @@ fn views_report(views: &DoneViews<'_>, index: &ContributionIndex) -> ViewsReport
     ViewsReport {
         view: used.iter().map(|view| view.name.clone()).collect(),
         raster_width_px: used.iter().map(|view| record(view).raster_width_px).collect(),
-        n_masks: index.n_masks_of_view().collect(),
-        n_regions: index.n_regions_of_view().collect(),
-        n_entries: index.n_entries_of_view().collect(),
+        n_masks: index.views.iter().map(|view| view.n_masks).collect(),
+        n_regions: index.views.iter().map(|view| view.file.n_regions).collect(),
+        n_entries: index.views.iter().map(|view| view.file.n_entries).collect(),
         secs: used.iter().map(|view| (f64::from(record(view).secs) * 1e3).round() / 1e3).collect(),
     }
 }
@@ -259,8 +259,12 @@ impl Opened {
             let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
             Ok(Photo { name: view.name.clone(), outlines })
         };
-        let photos: Vec<Photo> =
-            views.used.iter().zip(index.n_masks_of_view()).map(photo).collect::<Result<_, _>>()?;
+        let photos: Vec<Photo> = views
+            .used
+            .iter()
+            .zip(index.views.iter().map(|view| view.n_masks))
+            .map(photo)
+            .collect::<Result<_, _>>()?;
         let levels = photos.iter().flat_map(|photo| &photo.outlines).map(|outline| outline.level as u8);
         table.set_levels(levels.collect());
         let mut memory = plan.memory.clone();

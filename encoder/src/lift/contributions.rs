@@ -209,8 +209,8 @@ impl ViewContributions {
 #[derive(Clone, Debug)]
 pub struct ContributionFile {
     pub(super) path: PathBuf,
-    pub(super) n_regions: usize,
-    pub(super) n_entries: u64,
+    pub(crate) n_regions: usize,
+    pub(crate) n_entries: u64,
     entries_at_bytes: u64,
     /// By (cell, slice), ascending.
     pub runs: Vec<Run>,

@@ -78,18 +78,19 @@ impl PartContributions {
 
 /// A view's file, and the position of its regions and runs in the scene.
 #[derive(Debug)]
-pub(super) struct IndexedView {
-    pub(super) file: ContributionFile,
+pub(crate) struct IndexedView {
+    pub(crate) file: ContributionFile,
     /// Slice of each run, ascending.
     pub(super) slices: Vec<u32>,
-    pub(super) first_region: u32,
-    pub(super) n_masks: usize,
+    pub(crate) first_region: u32,
+    pub(crate) n_masks: usize,
 }
 
 /// Ordered by the views' names.
 pub struct ContributionIndex {
-    pub(super) views: Vec<IndexedView>,
-    pub(super) parts: Vec<Part>,
+    pub(crate) views: Vec<IndexedView>,
+    /// Ascending by cell and within it.
+    pub parts: Vec<Part>,
     /// Gaussians of each slice: indices within its cell.
     pub(super) locals_of_slice: Vec<Range<usize>>,
     /// Transposed parts, if a pass has read them and the budget holds them.
@@ -114,31 +115,13 @@ impl ContributionIndex {
         Self::open_with(paths, dim, n_gaussians_of_cell, PART_ENTRIES)
     }
 
+    /// With parts of at most `part_entries`.
     pub(super) fn open_with(
         paths: &[PathBuf],
         dim: usize,
         n_gaussians_of_cell: &[usize],
         part_entries: u64,
     ) -> Result<(Self, RegionTable), ContributionError> {
-        let mut table = RegionTable::new(dim);
-        let mut files = Vec::with_capacity(paths.len());
-        for path in paths {
-            let (file, regions) = ContributionFile::open(path)?;
-            if regions.dim != dim {
-                return Err(of_another_scene(path));
-            }
-            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region())?;
-            files.push((file, first_region, regions.mask_vectors.len() / dim));
-        }
-        Ok((Self::of_files(files, n_gaussians_of_cell, part_entries)?, table))
-    }
-
-    /// Takes opened files, each with its first region and its number of masks.
-    pub(super) fn of_files(
-        files: Vec<(ContributionFile, u32, usize)>,
-        n_gaussians_of_cell: &[usize],
-        part_entries: u64,
-    ) -> Result<Self, ContributionError> {
         let mut first_slice_of_cell = vec![0];
         let mut locals_of_slice = Vec::new();
         for n in n_gaussians_of_cell {
@@ -146,21 +129,28 @@ impl ContributionIndex {
             locals_of_slice.extend(starts.map(|start| start..(start + GAUSSIANS_PER_SLICE).min(*n)));
             first_slice_of_cell.push(locals_of_slice.len());
         }
-        let mut views = Vec::with_capacity(files.len());
+        let mut table = RegionTable::new(dim);
+        let mut views = Vec::with_capacity(paths.len());
         let mut entries_of_slice = vec![0u64; locals_of_slice.len()];
-        for (file, first_region, n_masks) in files {
+        for path in paths {
+            let (file, regions) = ContributionFile::open(path)?;
+            if regions.dim != dim {
+                return Err(of_another_scene(path));
+            }
+            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region())?;
             let slices = file.runs.iter().map(|run| {
                 let of_cell = first_slice_of_cell.get(run.cell_id as usize..=run.cell_id as usize + 1)?;
                 let slice = of_cell[0] + run.slice as usize;
                 (slice < of_cell[1]).then_some(slice as u32)
             });
             let Some(slices) = slices.collect::<Option<Vec<u32>>>() else {
-                return Err(of_another_scene(&file.path));
+                return Err(of_another_scene(path));
             };
             for (run, slice) in slices.iter().enumerate() {
                 let range = file.entries_of_run(run);
                 entries_of_slice[*slice as usize] += range.end - range.start;
             }
+            let n_masks = regions.mask_vectors.len() / dim;
             views.push(IndexedView { file, slices, first_region, n_masks });
         }
         let parts = first_slice_of_cell
@@ -170,34 +160,11 @@ impl ContributionIndex {
                 cut_into_parts(cell as u32, w[0]..w[1], &entries_of_slice, &locals_of_slice, part_entries)
             })
             .collect();
-        let kept = OnceLock::new();
-        Ok(Self { views, parts, locals_of_slice, kept })
-    }
-
-    /// Ascending by cell and within it.
-    pub fn parts(&self) -> &[Part] {
-        &self.parts
+        Ok((Self { views, parts, locals_of_slice, kept: OnceLock::new() }, table))
     }
 
     pub fn n_entries(&self) -> u64 {
         self.parts.iter().map(|part| part.n_entries).sum()
-    }
-
-    /// First region of each view, ordered by name.
-    pub(crate) fn first_regions(&self) -> Vec<u32> {
-        self.views.iter().map(|view| view.first_region).collect()
-    }
-
-    pub(crate) fn n_masks_of_view(&self) -> impl Iterator<Item = usize> + '_ {
-        self.views.iter().map(|view| view.n_masks)
-    }
-
-    pub(crate) fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
-        self.views.iter().map(|view| view.file.n_regions)
-    }
-
-    pub(crate) fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
-        self.views.iter().map(|view| view.file.n_entries)
     }
 
     pub fn len_bytes(&self) -> u64 {
@@ -301,14 +268,9 @@ fn cut_into_parts(
     parts
 }
 
-#[derive(Clone, Copy)]
-struct SliceRun<'a> {
-    view: usize,
-    entries: &'a [PackedEntry],
-}
-
 struct SliceTask<'a> {
-    runs: Vec<SliceRun<'a>>,
+    /// Numbers of views, and their entries.
+    runs: Vec<(usize, &'a [PackedEntry])>,
     starts: &'a mut [u64],
     first_entry: u64,
     regions: &'a mut [u32],
@@ -330,7 +292,7 @@ impl ContributionIndex {
             for run in runs.clone() {
                 let range = of_view.file.entries_of_run(run);
                 let entries = &entries[(range.start - base) as usize..(range.end - base) as usize];
-                runs_of_slice[of_view.slices[run] as usize - first_slice].push(SliceRun { view, entries });
+                runs_of_slice[of_view.slices[run] as usize - first_slice].push((view, entries));
             }
         }
         let mut contributions: Vec<PartContributions> =
@@ -344,7 +306,7 @@ impl ContributionIndex {
             let mut first_entry = 0;
             for slice in contributions.part.slices.clone() {
                 let runs = runs_of_slice.next().unwrap_or_default();
-                let n_entries: usize = runs.iter().map(|run| run.entries.len()).sum();
+                let n_entries: usize = runs.iter().map(|(_, entries)| entries.len()).sum();
                 let n = self.locals_of_slice[slice].len();
                 let task = SliceTask {
                     runs,
@@ -358,7 +320,11 @@ impl ContributionIndex {
                 tasks.push(task);
             }
         }
-        let counts: Vec<Vec<f32>> = self.views.par_iter().map(|view| view.mask_counts(table)).collect();
+        let mask_counts = |view: &IndexedView| {
+            let first = view.first_region as usize;
+            table.mask_counts(first..first + view.file.n_regions)
+        };
+        let counts: Vec<Vec<f32>> = self.views.par_iter().map(mask_counts).collect();
         tasks.into_par_iter().try_for_each(|task| self.transpose_slice(task, &counts))?;
         Ok(contributions)
     }
@@ -370,9 +336,7 @@ impl ContributionIndex {
         mask_counts: &[Vec<f32>],
     ) -> Result<(), ContributionError> {
         let mut next = [0u32; GAUSSIANS_PER_SLICE];
-        for run in &task.runs {
-            run.entries.iter().for_each(|e| next[e.in_slice()] += 1);
-        }
+        task.runs.iter().flat_map(|(_, entries)| *entries).for_each(|e| next[e.in_slice()] += 1);
         let mut at = 0;
         for (gaussian, next) in next.iter_mut().enumerate() {
             let n = std::mem::replace(next, at);
@@ -380,13 +344,13 @@ impl ContributionIndex {
             match task.starts.get_mut(gaussian) {
                 Some(end) => *end = task.first_entry + u64::from(at),
                 None if n == 0 => {}
-                None => return Err(self.views[task.runs[0].view].foreign_gaussian(gaussian)),
+                None => return Err(foreign_gaussian(&self.views[task.runs[0].0].file.path, gaussian)),
             }
         }
         let mut totals = [0.0f64; GAUSSIANS_PER_SLICE];
-        for run in &task.runs {
-            let (first_region, counts) = (self.views[run.view].first_region, &mask_counts[run.view]);
-            for entry in run.entries {
+        for (view, entries) in &task.runs {
+            let (first_region, counts) = (self.views[*view].first_region, &mask_counts[*view]);
+            for entry in *entries {
                 let at = &mut next[entry.in_slice()];
                 task.regions[*at as usize] = first_region + entry.region();
                 task.weights[*at as usize] = entry.weight;
@@ -400,17 +364,8 @@ impl ContributionIndex {
     }
 }
 
-impl IndexedView {
-    fn mask_counts(&self, table: &RegionTable) -> Vec<f32> {
-        let first = self.first_region as usize;
-        table.mask_counts(first..first + self.file.n_regions)
-    }
-
-    fn foreign_gaussian(&self, in_slice: usize) -> ContributionError {
-        let what = format!("a contribution of Gaussian {in_slice} to a slice with fewer Gaussians");
-        ContributionError::Damaged {
-            path: self.file.path.clone(),
-            source: ContainerError::Damaged { offset_bytes: 0, what },
-        }
-    }
+fn foreign_gaussian(path: &Path, in_slice: usize) -> ContributionError {
+    let what = format!("a contribution of Gaussian {in_slice} to a slice with fewer Gaussians");
+    let source = ContainerError::Damaged { offset_bytes: 0, what };
+    ContributionError::Damaged { path: path.to_owned(), source }
 }

@@ -133,11 +133,7 @@ impl Graph {
         let chunks = usable.par_chunks(GAUSSIANS_PER_TASK).enumerate();
         let chunks: Vec<Vec<Edge>> =
             chunks.map(|(at, chunk)| edges_of(chunk, at * GAUSSIANS_PER_TASK)).collect();
-        let mut edges: Vec<Edge> = vec![(0, 0, 0); chunks.iter().map(Vec::len).sum()];
-        let mut rest = &mut edges[..];
-        let places: Vec<&mut [Edge]> =
-            chunks.iter().map(|chunk| rest.split_off_mut(..chunk.len()).unwrap_or_default()).collect();
-        places.into_par_iter().zip(&chunks).for_each(|(place, chunk)| place.copy_from_slice(chunk));
+        let mut edges: Vec<Edge> = slag_raster::concat(&chunks);
         drop(chunks);
         edges.par_sort_unstable();
         Self { n_gaussians: scene.len(), usable, edges }

@@ -100,7 +100,7 @@ impl Masks {
         uncut_shares: Vec<f32>,
     ) -> Self {
         let n_objects = object_of_superpoint.iter().flatten().max().map_or(0, |last| *last as usize + 1);
-        let places = (0u32..).zip(scene.index.n_masks_of_view());
+        let places = (0u32..).zip(scene.index.views.iter().map(|view| view.n_masks));
         let mut masks = Self {
             of_object: vec![Vec::new(); n_objects],
             weights: vec![0.0; object_of_mask.len()],

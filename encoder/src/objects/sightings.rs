@@ -62,7 +62,7 @@ impl Sightings {
         table: &RegionTable,
         superpoints: &Superpoints,
     ) -> Result<Self, ContributionError> {
-        let regions = (0u32..).zip(scene.index.n_regions_of_view());
+        let regions = (0u32..).zip(scene.index.views.iter().map(|view| view.file.n_regions));
         let view_of_region: Vec<u32> = regions.flat_map(|(view, n)| std::iter::repeat_n(view, n)).collect();
         let mut entries = Vec::new();
         for contributions in scene.index.transposed_parts(table, scene.group_bytes) {

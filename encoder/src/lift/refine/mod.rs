@@ -103,7 +103,7 @@ impl PendingRefinement {
         }
         let refinement = Refinement {
             settings,
-            first_regions: scene.index.first_regions(),
+            first_regions: scene.index.views.iter().map(|view| view.first_region).collect(),
             mask_counts: table.mask_counts(0..table.len()),
             region_points: Vec::new(),
             mixtures: Vec::new(),

@@ -35,7 +35,7 @@ fn a_damaged_catalogue_is_made_anew_from_the_files() {
         files.iter().for_each(|path| damage(path));
         // Readers never trust a damaged catalogue.
         let seen = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies");
-        let generations = seen.map(|copy| copy.generations().expect("reads")).unwrap_or_default();
+        let generations = seen.map(|copy| copy.catalogue.generations().expect("reads")).unwrap_or_default();
         assert!(generations.iter().all(|record| record.n_cells <= 2), "damage {number}");
         let store = Store::create_or_open(dir.path()).unwrap_or_else(|e| panic!("damage {number}: {e}"));
         assert_eq!(store.next_generation().expect("reads"), 8, "damage {number}");
@@ -43,7 +43,7 @@ fn a_damaged_catalogue_is_made_anew_from_the_files() {
         let numbers: Vec<u64> = generations.iter().map(|record| record.generation).collect();
         assert_eq!(numbers, [6, 7], "damage {number}");
         store.publish(&manifest(8, &shards), &Extras::new()).expect("publishes");
-        assert!(StoreReader::open(dir.path()).expect("whole").listing().verify(|| {}).bad.is_empty());
+        assert!(StoreReader::open(dir.path()).expect("whole").verify(|| {}).bad.is_empty());
     }
 }
 
@@ -83,7 +83,7 @@ fn a_copy_is_read_while_a_writer_is_at_work() {
     fs_err::write(dir.path().join("tmp/7.part"), "of the writer").expect("writes");
     let before = snapshot_of(dir.path());
     let copy = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies").expect("there");
-    let generations = copy.generations().expect("reads");
+    let generations = copy.catalogue.generations().expect("reads");
     assert_eq!(generations.iter().map(|record| record.generation).collect::<Vec<_>>(), [1]);
     assert!(snapshot_of(dir.path()) == before, "the store was written to");
     drop(copy);
