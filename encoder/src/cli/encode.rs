@@ -186,22 +186,8 @@ fn parse_name(text: &str) -> Result<String, String> {
 }
 
 /// Names that trainers give to any splat or folder.
-const NAMES_OF_TRAINERS: [&str; 14] = [
-    "data",
-    "export",
-    "iteration",
-    "meta",
-    "model",
-    "out",
-    "output",
-    "outputs",
-    "ply",
-    "point_cloud",
-    "results",
-    "scene",
-    "splat",
-    "tmp",
-];
+const NAMES_OF_TRAINERS: &str =
+    "data export iteration meta model out output outputs ply point_cloud results scene splat tmp";
 
 /// Name of a splat: of its file, or of the nearest folder above with a name of its own.
 fn name_of(splat: &Path) -> Option<String> {
@@ -209,7 +195,7 @@ fn name_of(splat: &Path) -> Option<String> {
     let name = |part: &OsStr| Some(part.to_str()?.split('.').next()?.to_owned());
     let is_own = |name: &String| {
         let word = name.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches(['_', '-']);
-        !word.is_empty() && !NAMES_OF_TRAINERS.contains(&word.to_lowercase().as_str())
+        !word.is_empty() && !NAMES_OF_TRAINERS.split(' ').any(|known| known == word.to_lowercase())
     };
     let names = path.ancestors().filter_map(|part| name(part.file_name()?));
     names.filter(|name| parse_name(name).is_ok()).find(is_own)

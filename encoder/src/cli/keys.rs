@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand, ValueEnum};
-use serde::Serialize;
+use serde_json::json;
 use slag_common::tuf::format_utc;
 
 use super::common::{Exit, print, warn_of_expiry};
@@ -144,7 +144,7 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
             let n_keys = sign_draft(draft, root_keys)?;
             let line =
                 format!("signed with {n_keys} keys; next: slag-encoder keys install, where the store lies\n");
-            print(json, &Signed { n_keys }, line)?;
+            print(json, &json!({ "n_keys": n_keys }), line)?;
             Ok(Exit::Done)
         }
         KeysCommand::Install { draft, at } => {
@@ -152,11 +152,6 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
             changed(json, &Metadata::open(&at.store)?.install_root(draft, now)?)
         }
     }
-}
-
-#[derive(Serialize)]
-struct Signed {
-    n_keys: usize,
 }
 
 fn show(json: bool, status: &KeysStatus) -> Result<Exit> {

@@ -328,7 +328,7 @@ fn record_key(id: Hash32) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::tests::DAMAGES;
+    use crate::store::tests::{DAMAGES, new_store};
 
     fn keep(job: &Job, view: &str) {
         let contributions = ViewContributions {
@@ -354,12 +354,6 @@ mod tests {
 
     fn names(job: &Job) -> Vec<String> {
         job.done_views().expect("reads").into_keys().collect()
-    }
-
-    fn new_store() -> (tempfile::TempDir, Store) {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        (dir, store)
     }
 
     /// A view is done if its identity is: photos come, go and are replaced; leftovers go when the views are published.

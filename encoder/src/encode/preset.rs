@@ -75,24 +75,6 @@ mod tests {
         settings
     }
 
-    #[test]
-    fn presets_are_what_they_are_called() {
-        let [plain, fast, balanced] = [Preset::Plain, Preset::Fast, Preset::Balanced].map(settings);
-        // The same masks, so that only later steps differ.
-        assert_eq!(
-            (plain.aggregation, plain.cells.objects, plain.run.views_limit),
-            (Aggregation::default(), false, ViewsLimit::All)
-        );
-        assert_eq!(
-            plain.view,
-            super::super::ViewSettings { regions: Regions::Crops, ..balanced.view.clone() }
-        );
-        assert_eq!((fast.run.views_limit.of(96), fast.view.raster_width), (48, RasterWidth::Px(320)));
-        assert_eq!(fast.view.masks, Masks::Auto { n_levels: 2 });
-        assert_eq!(fast.aggregation, balanced.aggregation);
-        assert_eq!((balanced.aggregation, balanced.cells.objects), (Aggregation::REFINED, true));
-    }
-
     /// Oracle: the paper's text and LangSplat's `preprocess.py`, copied by hand.
     #[test]
     fn paper_has_the_papers_settings() {

@@ -293,21 +293,7 @@ impl Store {
 }
 
 /// Names in a store's folder, and of what a new disk has.
-const NAMES: [&str; 13] = [
-    "objects",
-    "metadata",
-    "extras",
-    "keys",
-    "tmp",
-    "db",
-    "db.damaged",
-    "job",
-    "drawn",
-    "models.json",
-    files::MANIFEST,
-    files::MANIFEST_PREVIOUS,
-    "lost+found",
-];
+const NAMES: &str = "objects metadata extras keys tmp db db.damaged job drawn models.json manifest manifest.previous lost+found";
 
 /// Refuses a folder with files that are none of a store's. A store, published or only begun, may have others besides.
 pub(crate) fn check_folder(dir: &Path) -> Result<(), StoreError> {
@@ -318,7 +304,7 @@ pub(crate) fn check_folder(dir: &Path) -> Result<(), StoreError> {
     let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
     let names = names.collect::<io::Result<BTreeSet<String>>>()?;
     let is_store = names.contains("objects") && (names.contains("extras") || names.contains("db"));
-    let mut others = names.iter().filter(|name| !NAMES.contains(&name.as_str()));
+    let mut others = names.iter().filter(|name| !NAMES.split(' ').any(|known| known == *name));
     match others.next() {
         Some(found) if !is_store => Err(StoreError::NotAStore { path: dir.to_owned(), found: found.clone() }),
         _ => Ok(()),

@@ -1,5 +1,5 @@
 use super::*;
-use crate::store::tests::manifest;
+use crate::store::tests::{manifest, new_store};
 use crate::store::{Extras, Store, StoreReader};
 
 fn files_of(folder: &Path, found: &mut Vec<PathBuf>) {
@@ -49,8 +49,7 @@ fn a_damaged_catalogue_is_made_anew_from_the_files() {
 
 #[test]
 fn the_catalogue_keeps_the_history() {
-    let dir = tempfile::tempdir().expect("a folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let shards: Vec<_> = ["a", "b", "c"].map(|text| store.put_bytes(text.as_bytes()).expect("room")).into();
     for generation in 1..=3 {
         let manifest = manifest(generation, &shards[..generation as usize]);
