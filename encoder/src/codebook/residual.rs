@@ -10,7 +10,7 @@ use slag_common::shard::{BLOCK, CODEWORDS, ScoreErrors};
 use slag_math::eigen::eigen_symmetric;
 use slag_math::matrix::Rows;
 
-use super::cluster::{clusters, nearest, squared_distance};
+use super::cluster::{Members, clusters, mean, nearest, squared_distance};
 
 const TRAINING_SAMPLE: usize = 6144;
 /// Most components of a subspace: 16 codewords describe more too coarsely.
@@ -168,19 +168,13 @@ pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
     /// Rounds after those of the clusters: more gain less than a hundredth.
     const ROUNDS: usize = 4;
     let mut codewords = clusters(points, 0.0, n_codewords).centres;
+    let n_codewords = codewords.len() / points.width;
     for _ in 0..ROUNDS {
-        let codes = nearest(points, &codewords);
-        let mut sums = vec![0.0f64; codewords.len()];
-        let mut counts = vec![0.0f64; codewords.len() / points.width];
-        for (point, code) in codes.iter().enumerate() {
-            counts[*code as usize] += 1.0;
-            let sum = &mut sums[*code as usize * points.width..][..points.width];
-            sum.iter_mut().zip(points.get(point)).for_each(|(s, v)| *s += f64::from(*v));
-        }
-        for (at, codeword) in codewords.iter_mut().enumerate() {
-            let count = counts[at / points.width];
-            if count > 0.0 {
-                *codeword = (sums[at] / count) as f32;
+        let members = Members::new(&nearest(points, &codewords), n_codewords);
+        for (number, codeword) in codewords.chunks_exact_mut(points.width).enumerate() {
+            let places = members.places(number);
+            if !places.is_empty() {
+                codeword.copy_from_slice(&mean(points, &members.order[places]));
             }
         }
     }

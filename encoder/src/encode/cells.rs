@@ -11,7 +11,7 @@ use std::sync::{Mutex, PoisonError};
 use slag_common::landmarks::BuiltLandmarks;
 use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::photo_poses::BuiltPhotoPoses;
-use slag_common::shard::Profile;
+use slag_common::shard::{Additions, Profile};
 use slag_common::{Hash32, View};
 
 use super::error::EncodeError;
@@ -33,7 +33,7 @@ use crate::lift::{
 use crate::memory::Phase;
 use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
-use crate::shard::{self, BuiltShard, CellEmbeddings, CellExtras, ShardBuilder};
+use crate::shard::{self, BuiltShard, CellEmbeddings, ShardBuilder};
 use crate::store::Extras;
 
 pub(super) struct BuiltCells {
@@ -432,9 +432,9 @@ impl CellMaker<'_> {
         let occupancy = self.occupancy.as_ref().map(|scene| scene.cells[cell_id as usize].view());
         let none = BuiltPhotoPoses::default();
         let photo_poses = self.photo_poses.as_ref().map_or(&none, |of_cells| &of_cells[cell_id as usize]);
-        let objects = self.objects.as_ref();
         let landmarks = self.landmarks.as_ref().and_then(|of_cells| of_cells[cell_id as usize].view());
-        let extras = CellExtras { objects, occupancy, photo_poses: photo_poses.view(), landmarks };
+        let photo_poses = photo_poses.view();
+        let additions = Additions { occupancy, photo_poses, landmarks, ..Additions::default() };
         let embeddings = &in_work.embeddings;
         let made = self.plan.context.time("codebook", || {
             ShardBuilder {
@@ -443,7 +443,7 @@ impl CellMaker<'_> {
                 score_context: &self.score_context,
                 settings: &settings.cells.shards,
             }
-            .build(cell_id, cell, embeddings, extras)
+            .build(cell_id, cell, embeddings, self.objects.as_ref(), additions)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
             let (hash, len_bytes) =

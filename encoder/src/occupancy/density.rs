@@ -113,9 +113,7 @@ impl Ellipsoid {
             }
         }
     }
-}
 
-impl Ellipsoid {
     /// Tiles that the box reaches along each axis.
     fn reached(&self) -> Option<Reached> {
         Some([self.tiles(0)?, self.tiles(1)?, self.tiles(2)?])

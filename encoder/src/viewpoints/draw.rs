@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec3};
 use image::{DynamicImage, ImageError, ImageFormat, Rgb, RgbImage};
 use rayon::prelude::*;
-use serde::Serialize;
 use serde_json::{Value, json};
 use slag_common::photo::{self, PhotoError};
 use slag_common::{Gaussians, Intrinsics, durable, npy};
@@ -77,8 +76,8 @@ pub(crate) fn check_folder(folder: &Path) -> Result<(), DrawError> {
     }
 }
 
-/// Draws views into `images/` of a folder, `with_depth` also into the files of [`Measured`], then writes the poses
-/// file. `drawn_from`: the splat, as the poses file names it.
+/// Draws views into `images/` of a folder, `with_depth` also their arrays, then writes the poses file. `drawn_from`: the
+/// splat, as the poses file names it.
 pub fn draw(
     folder: &Path,
     views: &mut [DrawnView],
@@ -90,47 +89,28 @@ pub fn draw(
     begin(folder, drawn_from)?;
     draw_images(folder, views, scene, progress, |view, drawing, _| {
         if with_depth {
-            Measured::of(view).write(folder, &drawing)?;
+            let shape = [drawing.height_px as usize, drawing.width_px as usize];
+            for (of, values) in [("depth", &drawing.depth), ("coverage", &drawing.coverage)] {
+                let path = folder.join(array_file(view, of));
+                path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
+                npy::write_file(&path, &shape, values)?;
+            }
         }
         Ok(drawing.image())
     })?;
     if with_depth {
         for view in &mut *views {
-            let measured = json!(Measured::of(view));
-            extend(&mut view.about, measured);
+            // Camera z in the splat's units (nerfstudio's name), 0 where no Gaussian is; and the splat's opacity, 0 to 1.
+            let [depth, coverage] = ["depth", "coverage"].map(|of| array_file(view, of));
+            extend(&mut view.about, json!({ "depth_file_path": depth, "coverage_file_path": coverage }));
         }
     }
     write_poses(folder, views, drawn_from, json!({}))
 }
 
-/// The arrays of a drawing: `.npy` files of 32-bit floats, `[height][width]`. The poses file has these members.
-#[derive(Serialize)]
-struct Measured {
-    /// Camera z in the splat's units (nerfstudio's name); 0 where no Gaussian is.
-    depth_file_path: PathBuf,
-    /// Opacity of the splat, 0 to 1.
-    coverage_file_path: PathBuf,
-}
-
-impl Measured {
-    fn of(view: &DrawnView) -> Self {
-        let name = Path::new(&view.name).with_extension("npy");
-        Self {
-            depth_file_path: Path::new("depth").join(&name),
-            coverage_file_path: Path::new("coverage").join(&name),
-        }
-    }
-
-    fn write(&self, folder: &Path, drawing: &Drawing) -> Result<(), DrawError> {
-        let shape = [drawing.height_px as usize, drawing.width_px as usize];
-        let files = [(&self.depth_file_path, &drawing.depth), (&self.coverage_file_path, &drawing.coverage)];
-        for (path, values) in files {
-            let path = folder.join(path);
-            path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
-            npy::write_file(&path, &shape, values)?;
-        }
-        Ok(())
-    }
+/// Of a view's array of 32-bit floats, `[height][width]`, below the folder.
+fn array_file(view: &DrawnView, of: &str) -> PathBuf {
+    Path::new(of).join(&view.name).with_extension("npy")
 }
 
 /// As [`draw`], sharpened by how much views blur as the Gaussians grow; small Gaussians change little. `about`: further

@@ -64,16 +64,17 @@ pub fn plan(
     memory.reserve(Phase::Views, "Gaussians that views are planned by", 3 * thin_bytes);
     memory.reserve(Phase::Views, "what planned views show", candidates::MOST as u64 * looks::LOOK_BYTES);
     memory.rest(0)?;
-    let thin = space::thinned(scene, stride)?;
+    let grown = (stride as f32).sqrt();
+    let thin = space::thinned(scene, stride, grown)?;
     let up = match settings.up {
         Some(up) => {
             up::Up { axis: up.try_normalize().ok_or(ViewpointError::BadUp(up))?, sign: up::Sign::Known }
         }
-        None => up::find(&thin.scene),
+        None => up::find(&thin),
     };
-    let mut space = Space::new(&thin, up.axis);
+    let mut space = Space::new(&thin, grown, up.axis);
     if up.sign == up::Sign::Unknown && large_from_above(&space, rasterizer)? {
-        space = Space::new(&thin, -up.axis);
+        space = Space::new(&thin, grown, -up.axis);
     }
     let mut kind = candidates::kind_of(&space);
     let mut looked = look_at_all(&space, rasterizer, kind, cancel)?;
@@ -81,7 +82,7 @@ pub fn plan(
     let is_solid = up.sign == up::Sign::Assumed && looked.len() < MIN_GOOD;
     if is_solid || is_object(&looked, &space, kind) {
         if up.sign != up::Sign::Known {
-            space = Space::new(&thin, up::OF_FILES);
+            space = Space::new(&thin, grown, up::OF_FILES);
         }
         kind = SceneKind::Object;
         looked = look_at_all(&space, rasterizer, kind, cancel)?;
