@@ -3,10 +3,8 @@
 //! The check draws sample views of the scene, compares each with its photo and, where they differ, looks for
 //! common mistakes in poses, intrinsics and splat.
 
-mod align;
 mod diagnosis;
 mod mistake;
-mod report;
 mod suspicion;
 #[cfg(test)]
 mod tests;
@@ -19,15 +17,12 @@ use crate::raster::{LoadedScene, Rasterizer};
 use diagnosis::{FLAWLESS_DB, Means, Samples};
 use view::{PLAIN_DB, at_width, mean, picture, picture_name};
 
-pub(crate) use align::Alignment;
-pub use align::align;
-pub use mistake::{FrameCandidate, FrameCause, Mistake, nerfstudio_defaults};
-pub use report::CheckError;
-pub use report::CheckOptions;
-pub use report::CheckReport;
-pub(crate) use report::ViewCheck;
+pub(crate) use diagnosis::ViewCheck;
+pub use diagnosis::{CheckOptions, CheckReport};
+pub(crate) use mistake::Alignment;
+pub use mistake::{FrameCandidate, FrameCause, Mistake, align, nerfstudio_defaults};
 pub use suspicion::{Suspicion, suspicions};
-pub use view::{CheckView, psnr_db};
+pub use view::{CheckError, CheckView, psnr_db};
 
 /// Draws the views of a scene and compares them with their photos.
 ///
@@ -54,7 +49,7 @@ where
         fs_err::create_dir_all(dir)?;
     }
     let loaded = rasterizer.load(scene)?;
-    let Compared { checks, unreadable, unusable_gaussians, samples } = compare(views, &*loaded, options)?;
+    let (checks, unreadable, unusable_gaussians, samples) = compare(views, &*loaded, options)?;
     let means = means_of(&checks);
     let mut suspicions: Vec<String> =
         options.suspicions.iter().map(|suspicion| suspicion.text.clone()).collect();
@@ -80,19 +75,13 @@ where
     })
 }
 
-/// Results for the views with readable photos, and samples for the diagnosis.
-struct Compared {
-    checks: Vec<ViewCheck>,
-    unreadable: Vec<IngestError>,
-    unusable_gaussians: usize,
-    samples: Samples,
-}
-
+/// Results for the views with readable photos, why others are not, most unusable Gaussians, and samples for the
+/// diagnosis.
 fn compare(
     views: impl ExactSizeIterator<Item = Result<CheckView, IngestError>>,
     scene: &dyn LoadedScene,
     options: &CheckOptions,
-) -> Result<Compared, CheckError> {
+) -> Result<(Vec<ViewCheck>, Vec<IngestError>, usize, Samples), CheckError> {
     let n_views = views.len();
     let (mut checks, mut unreadable) = (Vec::with_capacity(n_views), Vec::new());
     let mut unusable_gaussians = 0;
@@ -123,7 +112,7 @@ fn compare(
     }
     match checks.is_empty() {
         true => Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) }),
-        false => Ok(Compared { checks, unreadable, unusable_gaussians, samples }),
+        false => Ok((checks, unreadable, unusable_gaussians, samples)),
     }
 }
 

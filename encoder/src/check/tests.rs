@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use slag_common::{Similarity, View};
 
-use super::align::AlignError;
+use super::mistake::AlignError;
 use super::{FrameCause, Mistake, Suspicion, ViewCheck, align, means_of, nerfstudio_defaults, suspicions};
 use crate::raster::{RasterView, pinhole};
 
@@ -182,6 +182,8 @@ fn most_views_must_fit() {
     assert_eq!(fit(2, 2, 1), (true, false));
     assert_eq!(fit(3, 2, 3), (true, true));
     assert_eq!(fit(0, 5, 0), (false, false));
+    // A bare wall drawn well, and a black photo, whose own colour is exact.
+    assert!(checked(31.0, 40.0).fits() && !checked(5.0, f64::INFINITY).fits());
 }
 
 /// Intrinsics of photos of 640 x 480 pixels as people have them wrong, and right.

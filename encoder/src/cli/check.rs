@@ -8,10 +8,9 @@ use image::GrayImage;
 use slag_common::poses::SplatFrame;
 use slag_common::{Gaussians, Similarity, View, durable, files, poses, splat};
 
-use super::common;
 use super::common::{Exit, InputArgs, print};
 use super::memory::free_memory_bytes;
-use super::next;
+use super::{common, next};
 use crate::check::{
     self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Suspicion,
 };

@@ -10,8 +10,7 @@ use serde_json::json;
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Gaussians, View, poses};
 
-use super::common::{self, folder_of};
-use super::common::{Exit, print};
+use super::common::{self, Exit, folder_of, print};
 use super::memory::default_memory_bytes;
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};

@@ -13,15 +13,14 @@ use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
 use super::choices::ChoiceArgs;
-use super::common;
 use super::common::{
     Exit, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
     parse_secs, print, profile_parser, warn_of_expiry,
 };
 use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
-use super::next;
 use super::summary::lines;
+use super::{common, next};
 use crate::cells::PositionError;
 use crate::encode::front::{Expectation, Front, Target};
 use crate::encode::{

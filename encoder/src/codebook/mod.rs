@@ -18,8 +18,7 @@ use slag_common::shard::{self, ScoreErrors};
 
 use basis::{Basis, MAX_COMPONENTS};
 use cluster::{Clusters, Members};
-use measure::ScoreMoments;
-use measure::{Decoder, Reference};
+use measure::{Decoder, Reference, ScoreMoments};
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 

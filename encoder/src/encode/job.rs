@@ -9,7 +9,7 @@ use slag_common::container::ContainerError;
 use slag_common::{Hash32, View, durable};
 
 use super::error::EncodeError;
-use super::identity;
+use super::inputs;
 use super::settings::Restart;
 use super::view::{ViewRecord, ViewSink};
 use crate::lift::photos::{self, MaskOutline};
@@ -294,7 +294,7 @@ impl ViewSink for Job {
 
     /// Both were read by now: if they still have the planned content, they had it then.
     fn check_unchanged(&self, view: &View, segmenter: &dyn Segmenter) -> Result<(), EncodeError> {
-        let now = identity::of_view(self.of_scene, view, segmenter)?;
+        let now = inputs::of_view(self.of_scene, view, segmenter)?;
         match now == self.id_of_view[&view.name] {
             true => Ok(()),
             false => Err(EncodeError::Changed { view: view.name.clone() }),

@@ -10,12 +10,10 @@ mod context;
 pub mod coverage;
 mod error;
 pub mod front;
-mod identity;
 mod inputs;
 mod job;
 mod pipeline;
 mod plan;
-mod preset;
 mod publish;
 mod report;
 mod settings;
@@ -35,11 +33,11 @@ pub use context::Engines;
 pub(crate) use error::EncodeError;
 pub(crate) use inputs::count_inputs;
 pub(crate) use job::{JobStatus, job_status};
-pub use preset::Preset;
 pub use report::EncodeSummary;
 #[cfg(feature = "fleet")]
 pub(crate) use report::SkippedView;
 pub(crate) use report::{GpuReport, StageReport};
+pub use settings::Preset;
 #[cfg(feature = "fleet")]
 pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
@@ -48,7 +46,7 @@ pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, Restart,
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet_parts {
     pub(crate) use super::context::RunContext;
-    pub(crate) use super::identity::{OF_A_FLEET, of_scene};
+    pub(crate) use super::inputs::{OF_A_FLEET, of_scene};
     pub(crate) use super::plan::{Plan, segmenter_of};
     pub(crate) use super::report::LeftOut;
     pub(crate) use super::view::{PhotoSource, ViewRecord, ViewSink, ViewStages, ViewTools};

@@ -10,7 +10,6 @@ use slag_models::SessionOptions;
 use super::context::{Engines, RunContext};
 use super::coverage::{self, Coverage};
 use super::error::EncodeError;
-use super::identity;
 use super::inputs::{self, Inputs};
 use super::job::{Job, JobStatus, job_status};
 use super::report::LostViews;
@@ -18,16 +17,14 @@ use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSetting
 use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::ground::{self, Standing};
-use crate::landmarks;
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
-use crate::objects;
 use crate::raster::{self, LoadedScene, RasterView};
 use crate::segment::{
     GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter, WithStanding,
 };
-use crate::shard;
 use crate::store::{Store, StoreReader};
+use crate::{landmarks, objects, shard};
 
 pub(crate) struct Plan<'a> {
     pub(crate) context: &'a RunContext<'a>,
@@ -85,7 +82,7 @@ pub(super) fn plan<'a>(
         tracing::warn!("{without}");
     }
     let (of_scene, id_of_view) = context.time("identity", || {
-        let of = || identity::identities(settings, engines, segmenter.as_ref(), rasterizer, inputs);
+        let of = || inputs::identities(settings, engines, segmenter.as_ref(), rasterizer, inputs);
         context.install(of)
     })?;
     let lost_views = lost_views(store, of_scene)?;

@@ -16,8 +16,7 @@ use super::error::EncodeError;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary, LeftOut};
 use super::settings::Masks;
-use super::views::DoneViews;
-use super::views::Executor;
+use super::views::{DoneViews, Executor};
 use crate::store::{ModelsRecord, Store};
 
 /// Publishes the built cells, ends the job and returns the summary.

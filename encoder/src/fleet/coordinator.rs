@@ -8,13 +8,11 @@ use rayon::prelude::*;
 use slag_common::{Hash32, durable};
 
 use super::documents::{self, FailedView};
-use super::error::FleetError;
 use super::heartbeat::Heartbeat;
-use super::inputs;
-use super::objects;
 use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
+use super::{FleetError, objects, prepared};
 use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, ViewRecord, ViewsRun};
 use crate::encode::{EncodeError, Engines, SkippedView};
@@ -39,7 +37,7 @@ impl Coordinator {
     ) -> Result<ViewsInWork<'_>, FleetError> {
         let is_open = |view: &usize| !done.contains_key(&plan.inputs.views[*view].name);
         let open: Vec<usize> = plan.order.iter().copied().filter(is_open).collect();
-        let run_plan = inputs::upload(&self.bucket, plan, &open)?;
+        let run_plan = prepared::upload(&self.bucket, plan, &open)?;
         let run = Run::begin(&self.bucket, &run_plan)?;
         let open_queue = |queue| Enqueuer::open(&self.bucket.runtime, queue, run, run_plan.of_scene);
         let queue = self.queue.as_ref().map(open_queue).transpose()?;

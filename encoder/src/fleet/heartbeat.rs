@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
-use super::error::FleetError;
+use super::FleetError;
 use super::run::Run;
 use crate::blobs::Bucket;
 

@@ -18,8 +18,8 @@ use futures_util::StreamExt;
 use slag_common::Hash32;
 use tokio::runtime::Runtime;
 
+use super::FleetError;
 use super::dispatch::{Dispatcher, OpenViews};
-use super::error::FleetError;
 use super::run::Run;
 
 const CONSUMER: &str = "workers";

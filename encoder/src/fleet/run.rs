@@ -2,8 +2,8 @@
 //! coordinator's word that it publishes, or by that of the next run's coordinator. Both put the same object on
 //! condition that it is not there, so one put decides whether a run is published.
 
+use super::FleetError;
 use super::documents::{self, End, PlannedBy, RunPlan};
-use super::error::FleetError;
 use crate::blobs::Bucket;
 
 /// Keys of a run: how it ended; all its views are done.

@@ -6,9 +6,8 @@ use slag_common::View;
 
 use super::dispatch::Dispatcher;
 use super::documents::{self, FailedView};
-use super::error::FleetError;
-use super::objects;
 use super::prepared::Prepared;
+use super::{FleetError, objects};
 use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{
     PhotoSource, RunContext, ViewRecord, ViewSink, ViewStages, ViewTools, work_off,

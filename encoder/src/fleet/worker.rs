@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use super::FleetError;
 use super::dispatch::{Dispatcher, Share};
 use super::documents::{self, FailedView, RunPlan};
-use super::error::FleetError;
 use super::heartbeat::HeartbeatWatch;
 use super::prepared::Prepared;
 use super::queue::{Queue, QueueSettings};

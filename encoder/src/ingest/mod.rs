@@ -1,5 +1,7 @@
 //! Ingest: loads photos as ideal pinhole images of known size.
 
+mod splat_frame;
+
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -10,11 +12,8 @@ use serde::Deserialize;
 use slag_common::photo::{self, PhotoError};
 use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View, files};
 
-mod splat_frame;
-
-pub use splat_frame::{Activated, FrameChoice, to_poses};
+pub use splat_frame::{Activated, FrameChoice, GeoError, read_geo_reference, to_poses};
 pub(crate) use splat_frame::{FoundFrame, find_frame};
-pub use splat_frame::{GeoError, read_geo_reference};
 
 /// Largest factor by which photos may be downscaled from the size in the intrinsics.
 const MAX_DOWNSCALE: u32 = 64;

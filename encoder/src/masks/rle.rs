@@ -6,8 +6,7 @@
 
 use serde::Serialize;
 
-use super::mask::Bits;
-use super::mask::{BoxPx, Mask};
+use super::mask::{Bits, BoxPx, Mask};
 
 /// Most digits of a signed 32-bit number, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;

@@ -16,7 +16,7 @@ use slag_common::objects::{
 use slag_common::shard::Basis;
 use slag_math::cholesky::{SmallPivots, cholesky};
 
-use super::object::{MAX_MEDOIDS, NONE, Object, SceneObjects};
+use super::{MAX_MEDOIDS, NONE, Object, SceneObjects};
 use crate::progress::Progress;
 
 const N_VECTORS: usize = 1 + MAX_MEDOIDS;
@@ -150,7 +150,31 @@ impl CellObjects {
         let mut number_of = vec![NO_OBJECT; n_here.len()];
         for (number, object) in here.into_iter().enumerate() {
             number_of[object] = number as u16;
-            cell.add(&scene.objects[object], n_here[object], basis);
+            let Object {
+                id, n_gaussians, position_in_world, box_in_world, vectors, photo, photo_box_px, ..
+            } = &scene.objects[object];
+            let name = plain(photo);
+            // Many objects share their best photo.
+            let photo_start = cell.photos.find(&name).unwrap_or_else(|| {
+                cell.photos.push_str(&name);
+                cell.photos.len() - name.len()
+            });
+            cell.records.push(ObjectRecord {
+                id: *id,
+                position_in_world: position_in_world.to_array(),
+                box_min: box_in_world.min.to_array(),
+                box_max: box_in_world.max.to_array(),
+                n_gaussians: *n_gaussians,
+                n_gaussians_here: n_here[object],
+                photo_box_px: *photo_box_px,
+                photo_start: photo_start as u32,
+                photo_bytes: name.len() as u32,
+            });
+            let (components, steps) = quantise_vectors(&basis.components(vectors), basis.m(), N_VECTORS);
+            let error = basis.largest_error(vectors, &components, &steps);
+            cell.header.score_error_bound = cell.header.score_error_bound.max(error);
+            cell.vectors.extend(components);
+            cell.steps.extend(steps);
             let (ends, pictures) = &mut cell.thumbnails;
             pictures.extend(scene.thumbnails.get(object).into_iter().flatten());
             ends.push(pictures.len() as u32);
@@ -163,31 +187,6 @@ impl CellObjects {
         (cell.header.n_runs, cell.header.photos_bytes) =
             (cell.run_ends.len() as u32, cell.photos.len() as u32);
         cell
-    }
-
-    fn add(&mut self, object: &Object, n_gaussians_here: u32, basis: &CentroidBasis<'_>) {
-        let name = plain(&object.photo);
-        // Many objects share their best photo.
-        let photo_start = self.photos.find(&name).unwrap_or_else(|| {
-            self.photos.push_str(&name);
-            self.photos.len() - name.len()
-        });
-        self.records.push(ObjectRecord {
-            id: object.id,
-            position_in_world: object.position_in_world.to_array(),
-            box_min: object.box_in_world.min.to_array(),
-            box_max: object.box_in_world.max.to_array(),
-            n_gaussians: object.n_gaussians,
-            n_gaussians_here,
-            photo_box_px: object.photo_box_px,
-            photo_start: photo_start as u32,
-            photo_bytes: name.len() as u32,
-        });
-        let (components, steps) = quantise_vectors(&basis.components(&object.vectors), basis.m(), N_VECTORS);
-        let error = basis.largest_error(&object.vectors, &components, &steps);
-        self.header.score_error_bound = self.header.score_error_bound.max(error);
-        self.vectors.extend(components);
-        self.steps.extend(steps);
     }
 
     pub fn view(&self) -> Objects<'_> {

@@ -10,7 +10,7 @@ use slag_raster::{
     WeightSink, bin, check_scene, check_view, concat, walk_tile,
 };
 
-use super::rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
+use super::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
 use crate::masks::{NO_REGION, RegionMap};
 use crate::memory::{MemoryPlan, Phase};
 

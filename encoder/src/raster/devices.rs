@@ -10,7 +10,7 @@ use slag_raster::{Drawing, RasterView};
 
 use super::cpu::CpuRasterizer;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
-use super::rasterizer::{GpuSlots, LoadedScene, RasterError, Rasterizer, ViewWeights};
+use super::{GpuSlots, LoadedScene, RasterError, Rasterizer, ViewWeights};
 use crate::lanes::Lanes;
 use crate::masks::RegionMap;
 

@@ -18,7 +18,7 @@ use slag_models::SessionOptions;
 use slag_models::boundaries::Boundaries;
 use slag_models::session::SessionError;
 
-use super::segmenter::{SegmentError, SegmentInput, Segmenter};
+use super::{SegmentError, SegmentInput, Segmenter};
 use crate::masks::regions::nearest;
 use crate::masks::{Bits, BoxPx, Mask, NO_REGION, masks_of_labels};
 

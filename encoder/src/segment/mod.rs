@@ -3,11 +3,196 @@
 mod given;
 mod graph;
 mod sam;
-mod segmenter;
 mod standing;
+
+use std::io;
+use std::path::PathBuf;
+
+use image::RgbImage;
+use rayon::ThreadPool;
+use slag_common::files::NotUtf8;
+use slag_common::{Hash32, View};
+use slag_models::session::SessionError;
+
+use crate::ingest::{LoadedImage, Undistorter};
+use crate::lanes::GpuLoad;
+use crate::masks::Mask;
+use crate::masks::rle::RleError;
 
 pub use given::{GivenMasks, file_of as mask_file};
 pub use graph::{GraphSegmenter, GraphSettings};
 pub use sam::{SamLevels, SamSegmenter, SamSettings, ScoreFilter};
-pub use segmenter::{NoMasks, SegmentError, SegmentInput, Segmenter};
 pub(crate) use standing::WithStanding;
+
+/// Limit on a view's masks: the total area of their boxes, one byte per pixel.
+pub(super) const MAX_MASK_BYTES: u64 = 1 << 30;
+
+pub trait Segmenter: Sync {
+    /// Method, every parameter, and hashes of the weights. Segmenters of equal identity find the same masks in a photo
+    /// if [`Self::identity_of_view`] is equal, too.
+    fn identity(&self) -> String;
+
+    /// Hash of what the view's masks come from beside the photo: its mask file; `None` if nothing.
+    fn identity_of_view(&self, _view: &View) -> Result<Option<Hash32>, SegmentError> {
+        Ok(None)
+    }
+
+    /// Checks that views have masks, for masks that exist already; returns a sentence on those without.
+    fn check_views(&self, _views: &[View], _strict: bool) -> Result<Option<String>, SegmentError> {
+        Ok(None)
+    }
+
+    /// Whether it uses [`SegmentInput::depth`], which costs a drawing of the scene.
+    fn wants_depth(&self) -> bool {
+        false
+    }
+
+    /// Photos that its own threads or device process at once; `None` if it works on the caller's thread.
+    fn concurrency(&self) -> Option<usize> {
+        None
+    }
+
+    /// Load of each GPU that runs its models; none on the processor.
+    fn loads(&self) -> Vec<GpuLoad> {
+        Vec::new()
+    }
+
+    /// Masks may overlap.
+    fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError>;
+}
+
+#[derive(Clone, Copy, Debug)]
+pub struct SegmentInput<'a> {
+    /// With the intrinsics of `image` (an ideal pinhole).
+    pub view: &'a View,
+    pub image: &'a RgbImage,
+    /// Pixels inside the lens image, row-major; `None` if all are.
+    pub valid: Option<&'a [bool]>,
+    /// Mapping that undistorted the photo, to apply to existing masks.
+    pub undistorter: Option<&'a Undistorter>,
+    /// Depth of the scene, camera z per pixel of `image`, row-major; 0 or NaN if unknown.
+    pub depth: Option<&'a [f32]>,
+    /// Threads for [`Self::install`]. A segmenter with its own threads must not be called from one of these: it would
+    /// wait for itself.
+    pub pool: Option<&'a ThreadPool>,
+}
+
+impl<'a> SegmentInput<'a> {
+    /// Without a pool.
+    pub fn new(loaded: &'a LoadedImage, depth: Option<&'a [f32]>) -> Self {
+        Self {
+            view: &loaded.view,
+            image: &loaded.image,
+            valid: loaded.valid.as_deref(),
+            undistorter: loaded.undistorter.as_ref(),
+            depth,
+            pool: None,
+        }
+    }
+
+    /// Runs work, with its parallel iterators, on the pool's threads; without a pool, on the caller's.
+    pub(super) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        match self.pool {
+            Some(pool) => pool.install(work),
+            None => work(),
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+pub struct NoMasks;
+
+impl Segmenter for NoMasks {
+    fn identity(&self) -> String {
+        "no masks".into()
+    }
+
+    fn segment(&self, _input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
+        Ok(Vec::new())
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum SegmentError {
+    #[error("{0}; check that the file exists and may be read")]
+    Io(#[from] io::Error),
+    #[error("{}: {source}; write the mask image again", path.display())]
+    Png {
+        path: PathBuf,
+        #[source]
+        source: png::DecodingError,
+    },
+    #[error("{}: found {found} pixels, expected ids; write a PNG with up to 16 bits of gray, or with a palette", path.display())]
+    NotIds { path: PathBuf, found: &'static str },
+    #[error(
+        "{}: soft edges: {n} values between black and white lie only where they meet, expected an id for each mask; write black \
+         where a pixel is outside, white where it is inside, nothing between", path.display()
+    )]
+    SoftEdges { path: PathBuf, n: usize },
+    #[error("{}: {what}; {advice}", path.display())]
+    StandIn { path: PathBuf, what: &'static str, advice: &'static str },
+    #[error(
+        "{}: {source}; expected SAM's list of masks, each with segmentation {{size, counts}}, or a COCO data set",
+        path.display()
+    )]
+    Json {
+        path: PathBuf,
+        #[source]
+        source: serde_json::Error,
+    },
+    #[error("{}: {source}", path.display())]
+    Text {
+        path: PathBuf,
+        #[source]
+        source: NotUtf8,
+    },
+    #[error("{}: {what}; correct it, or export the data set again", path.display())]
+    DataSet { path: PathBuf, what: String },
+    #[error(
+        "{}: it may have the masks of {first:?} or of {second:?}; name each file of masks after all of its photo's name, such \
+         as {first}.png",
+        path.display()
+    )]
+    TwoPhotos { path: PathBuf, first: String, second: String },
+    #[error("{}: mask {index}: {source}", path.display())]
+    Rle {
+        path: PathBuf,
+        index: usize,
+        #[source]
+        source: RleError,
+    },
+    #[error(
+        "{}: the masks have {} x {} px but the photo of view {view:?} {} x {} px; make the masks from the same photos",
+        path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1]
+    )]
+    Size { path: PathBuf, view: String, found_px: [u32; 2], expected_px: [u32; 2] },
+    #[error(
+        "{}: the bounding boxes of the masks exceed {limit_bytes} px in total; remove stray pixels or give fewer masks",
+        path.display()
+    )]
+    TooLarge { path: PathBuf, limit_bytes: u64 },
+    #[error(
+        "{}: no masks of any photo: for {view:?} expected a file of that name with the ending .png or .json (or a folder with \
+         0.png, 1.png ...), or a COCO file_name like it; found {found}{hint}", path.display()
+    )]
+    NoMatch { path: PathBuf, view: String, found: String, hint: &'static str },
+    #[error("{}: {n} of {of} photos have no masks, the first is {view:?}; make them, or leave out --strict", path.display())]
+    Missing { path: PathBuf, view: String, n: usize, of: usize },
+    #[error(transparent)]
+    Model(Box<SessionError>),
+    #[error(
+        "view {view}: the mask model's output is not finite; run it with --provider cpu, or give another"
+    )]
+    NotFinite { view: String },
+    #[error(
+        "view {view}: the masks found exceed {limit_bytes} bytes; lower --points-per-side, or raise \
+         --sam-predicted-iou and --sam-stability"
+    )]
+    TooManyMasks { view: String, limit_bytes: u64 },
+}
+
+impl From<SessionError> for SegmentError {
+    fn from(error: SessionError) -> Self {
+        Self::Model(Box::new(error))
+    }
+}

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::segmenter::{SegmentError, SegmentInput, Segmenter};
+use super::{SegmentError, SegmentInput, Segmenter};
 use crate::ground::{NO_THING, Standing};
 use crate::lanes::GpuLoad;
 use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};

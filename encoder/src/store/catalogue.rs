@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 
-use super::error::StoreError;
+use super::StoreError;
 
 /// sled keeps whole pages in memory; the records are small.
 const CACHE_BYTES: u64 = 16 << 20;

@@ -12,9 +12,8 @@ use slag_common::tuf::{
     Body, Key, Root, SignedMetadata, Trusted, TufError, add_signatures, sha256_hex, sign,
 };
 
-use super::error::StoreError;
 use super::metadata::{Metadata, MetadataReader, ROOT_SECS};
-use super::{files, roles};
+use super::{StoreError, files, roles};
 
 pub(crate) use super::roles::root_folder as default_root_folder;
 

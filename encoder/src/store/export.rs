@@ -15,11 +15,10 @@ use serde::Serialize;
 use slag_common::tuf::{TargetFile, TufError};
 use slag_common::{Hash32, durable, manifest};
 
-use super::error::StoreError;
-use super::files;
 use super::metadata::clock_unix_secs;
 use super::reader::{Published, StoreReader};
 use super::verify::{self, Refused};
+use super::{StoreError, files};
 
 const FIRST_ROOT: &str = "1.root.json";
 

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::{self, ManifestError};
 
-use super::error::StoreError;
+use super::StoreError;
 
 pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
 

@@ -23,8 +23,7 @@ use slag_common::tuf::{
     SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, parse_utc, sign,
 };
 
-use super::error::StoreError;
-use super::{files, reader, roles};
+use super::{StoreError, files, reader, roles};
 
 pub(crate) const TIMESTAMP_FILE: &str = "timestamp.json";
 /// Validity of a timestamp, unless a refresh says otherwise.

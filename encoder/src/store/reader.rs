@@ -11,9 +11,8 @@ use slag_common::manifest::{Manifest, ShardRecord, TextModelRecord};
 use slag_common::objects::Objects;
 use slag_common::shard::{ShardLayout, ShardView};
 
-use super::error::StoreError;
-use super::files;
 use super::files::ModelsRecord;
+use super::{StoreError, files};
 
 /// Objects by name that belong to a generation but are not sent to robots.
 pub type Extras = BTreeMap<String, Hash32>;

@@ -16,7 +16,7 @@ use ed25519_dalek::SigningKey;
 use slag_common::Hash32;
 use slag_common::tuf::{Body, Key, RoleKeys, Root, generate_key};
 
-use super::error::StoreError;
+use super::StoreError;
 use super::files::{self, Access};
 
 /// Roles whose keys lie with the store.

@@ -519,3 +519,25 @@ fn an_export_replaces_nothing_else() {
     assert!(refused.contains("1.root.json: robots follow another store here"), "{refused}");
     export(dir.path(), out.path()).expect("the same store");
 }
+
+/// A full or read-only disk is no damaged database.
+#[test]
+fn advice_fits_the_fault_of_the_disk() {
+    let said = |error: io::Error| {
+        let path = PathBuf::from("db");
+        let of_files = StoreError::Io(io::Error::new(error.kind(), error.to_string())).to_string();
+        (of_files, StoreError::Records { path, cause: sled::Error::Io(error) }.to_string())
+    };
+    for (error, expected) in [
+        (io::Error::from(io::ErrorKind::StorageFull), "free space"),
+        (io::Error::other("No space left on device (os error 28)"), "free space"),
+        (io::Error::from(io::ErrorKind::PermissionDenied), "the right to read and write"),
+        (io::Error::from(io::ErrorKind::ReadOnlyFilesystem), "takes no writes"),
+    ] {
+        let (of_files, of_records) = said(error);
+        assert!(of_files.contains(expected) && of_records.contains(expected), "{of_files}; {of_records}");
+        assert!(!of_records.contains("remove this folder"), "{of_records}");
+    }
+    let (_, damaged) = said(io::Error::from(io::ErrorKind::InvalidData));
+    assert!(damaged.contains("remove this folder"), "{damaged}");
+}

@@ -12,10 +12,9 @@ use slag_common::Hash32;
 use slag_common::manifest::{Manifest, ShardRecord, TARGET, TextModelRecord};
 use slag_common::tuf::{Trusted, TufError};
 
-use super::error::{StoreError, metadata_fault, metadata_help};
-use super::files;
 use super::metadata::{self, TIMESTAMP_FILE, clock_unix_secs, folder, names, read_published};
 use super::reader::{Extras, StoreReader};
+use super::{StoreError, files, metadata_fault, metadata_help};
 
 /// Objects of the current and the previous generation: content of each, by hash and length if a manifest states it.
 type Listing = BTreeMap<(Hash32, Option<u64>), Vec<String>>;

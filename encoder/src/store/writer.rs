@@ -11,11 +11,10 @@ use slag_common::Hash32;
 use slag_common::manifest::{Manifest, ManifestError};
 
 use super::catalogue::Catalogue;
-use super::error::{StoreError, manifest_fault};
 use super::files::{self, Access, HashingWriter, ModelsRecord};
 use super::metadata::Metadata;
 use super::reader::{self, Extras, Published, StoreReader};
-use super::verify;
+use super::{StoreError, manifest_fault, verify};
 
 /// sled releases the lock of a writer that has just ended on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);

@@ -1,6 +1,5 @@
 //! Viewpoints: where to draw a splat that has no photos, from its Gaussians alone.
 
-mod candidates;
 mod draw;
 mod looks;
 mod plan;
@@ -62,7 +61,7 @@ pub fn plan(
     memory.reserve(Phase::Always, "the scene with its colours", scene.len_bytes());
     let thin_bytes = Gaussians::decoded_bytes(scene.len() / stride, 0) as u64;
     memory.reserve(Phase::Views, "Gaussians that views are planned by", 3 * thin_bytes);
-    memory.reserve(Phase::Views, "what planned views show", candidates::MOST as u64 * looks::LOOK_BYTES);
+    memory.reserve(Phase::Views, "what planned views show", looks::MOST as u64 * looks::LOOK_BYTES);
     memory.rest(0)?;
     let grown = (stride as f32).sqrt();
     let thin = space::thinned(scene, stride, grown)?;
@@ -76,7 +75,7 @@ pub fn plan(
     if up.sign == up::Sign::Unknown && large_from_above(&space, rasterizer)? {
         space = Space::new(&thin, grown, -up.axis);
     }
-    let mut kind = candidates::kind_of(&space);
+    let mut kind = looks::kind_of(&space);
     let mut looked = look_at_all(&space, rasterizer, kind, cancel)?;
     // A ball has no floor, and no place within; a room full of floaters has a floor.
     let is_solid = up.sign == up::Sign::Assumed && looked.len() < MIN_GOOD;
@@ -118,7 +117,7 @@ fn look_at_all(
     cancel: &AtomicBool,
 ) -> Result<Vec<Look>, ViewpointError> {
     let loaded = rasterizer.load(&space.scene)?;
-    let looked = candidates::of(kind, space).into_par_iter().map(|camera| {
+    let looked = looks::of(kind, space).into_par_iter().map(|camera| {
         if cancel.load(Ordering::Relaxed) {
             return Err(ViewpointError::Interrupted);
         }

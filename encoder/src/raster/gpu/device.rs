@@ -5,8 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use pollster::block_on;
 
 use super::shader::Kernels;
-use crate::raster::rasterizer::RasterError;
-use crate::raster::rasterizer::{AdapterReport, Precision};
+use crate::raster::{AdapterReport, Precision, RasterError};
 
 fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
     let info = adapter.get_info();

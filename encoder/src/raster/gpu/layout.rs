@@ -7,8 +7,7 @@ use slag_raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
 use slag_raster::{RasterView, reach2};
 
 use super::shader::{Counter, Counts, SUM_FRACTION_BITS};
-use crate::raster::rasterizer::Precision;
-use crate::raster::rasterizer::RegionWeight;
+use crate::raster::{Precision, RegionWeight};
 
 /// A Gaussian in device memory.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]

@@ -23,10 +23,10 @@ use slag_math::stats::{Rank, quantile};
 use slag_raster::constants::TILE_SIZE_PX;
 use slag_raster::{Drawing, RasterView, ViewCounters, check_scene, check_view, colour};
 
+pub(crate) use super::AdapterReport;
 use super::cpu::{CpuRasterizer, check_regions};
-pub(crate) use super::rasterizer::AdapterReport;
-pub use super::rasterizer::{GpuOptions, Precision};
-use super::rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
+pub use super::{GpuOptions, Precision};
+use super::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
 use crate::masks::RegionMap;
 pub(crate) use device::Adapter;
 pub use device::{Device, adapters};

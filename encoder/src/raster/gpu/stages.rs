@@ -6,8 +6,7 @@ use std::collections::HashMap;
 use wgpu::BufferUsages as Usage;
 
 use super::device::Device;
-use super::jobs::Buffers;
-use super::jobs::{DIGIT_BITS, DISPATCH_BYTES, JOB_STRIDE_BYTES, Scan, SortKey, part, sort_job};
+use super::jobs::{Buffers, DIGIT_BITS, DISPATCH_BYTES, JOB_STRIDE_BYTES, Scan, SortKey, part, sort_job};
 use super::layout::{Chunk, ScanJob, SceneGaussian};
 use super::shader::{Counter, NONE, WORKGROUP_SIZE};
 

@@ -5,12 +5,13 @@ use slag_raster::constants::TILE_SIZE_PX;
 use wgpu::BufferUsages as Usage;
 
 use super::device::Device;
-use super::jobs::{Buffers, COUNTERS_BYTES, Size, VIEW_BYTES, regions_bytes};
-use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
+use super::jobs::{
+    Buffers, COUNTERS_BYTES, Size, SortKey, VIEW_BYTES, bits_of, depth_keys, regions_bytes, write_sort_jobs,
+};
 use super::layout::{Background, Capacities, RegionSum, ViewBlock};
 use super::shader::{Counter, Counts};
 use super::stages::{SceneChunk, Stages, bind, dispatch, number, whole};
-use crate::raster::rasterizer::RasterError;
+use crate::raster::RasterError;
 
 pub(crate) const PIXEL_BYTES: u64 = 20;
 

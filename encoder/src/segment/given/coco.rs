@@ -11,7 +11,7 @@ use crate::ingest::Undistorter;
 use crate::masks::regions::partition;
 use crate::masks::rle::{Rle, RleError};
 use crate::masks::{Bits, BoxPx, Mask, NO_REGION};
-use crate::segment::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput};
+use crate::segment::{MAX_MASK_BYTES, SegmentError, SegmentInput};
 
 /// By file name, with indices in the file.
 pub(super) type MasksOfImage = BTreeMap<String, Vec<(usize, Rle)>>;

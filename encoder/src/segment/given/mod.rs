@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use slag_common::{Hash32, View, files};
 
-use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
+use super::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::masks::rle::Rle;
 use crate::masks::{Mask, NO_REGION, masks_of_labels};
 use coco::too_large;
