@@ -51,8 +51,8 @@ impl<'a> RunContext<'a> {
         cancel: &'a AtomicBool,
     ) -> Result<Self, EncodeError> {
         let start = Instant::now();
-        let workers =
-            Workers::start(n_threads).map_err(|source| EncodeError::Threads { n_threads, source })?;
+        let failed = |error| format!("cannot start {n_threads} threads: {error}; use fewer with --threads");
+        let workers = Workers::start(n_threads).map_err(|error| EncodeError::Failed(failed(error)))?;
         let phases = Mutex::new(vec![Began { phase: Phase::Read, at: start, peak_before: None }]);
         Ok(Self { start, progress, cancel, times: Mutex::default(), phases, workers })
     }

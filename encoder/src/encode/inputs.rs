@@ -63,7 +63,9 @@ impl Inputs {
         }
         let (views, mut missing) = find_views(settings, set.views)?;
         if let (true, Some((view, reason))) = (settings.run.strict, damaged.first()) {
-            return Err(EncodeError::NoPose { view: view.clone(), reason: reason.clone() });
+            return Err(EncodeError::Failed(format!(
+                "view {view} has no pose: {reason}; remove it from the poses, or leave out --strict"
+            )));
         }
         missing.extend(damaged.into_iter().map(|(view, reason)| SkippedView { view, reason }));
         context.install(|| check::suspicions(&scene, &views)).iter().for_each(|suspicion| {
@@ -76,7 +78,12 @@ impl Inputs {
         let n_visible =
             (0..scene.len()).filter(|i| scene.is_usable(*i) && scene.opacities[*i] >= 1.0 / 255.0).count();
         if split.cells.is_empty() || n_visible * MIN_VISIBLE_ONE_IN < scene.len() {
-            return Err(EncodeError::NoGaussians { path: inputs.scene.clone(), n_gaussians: scene.len() });
+            return Err(EncodeError::Failed(format!(
+                "{}: hardly any of {} Gaussians can be seen (finite, positive scales, a rotation, not transparent); export the \
+                 splat again",
+                inputs.scene.display(),
+                scene.len()
+            )));
         }
         if split.n_for_precision > cells::MAX_CELLS_FOR_PRECISION {
             let (n, most) = (split.n_for_precision, cells::MAX_CELLS_FOR_PRECISION);
@@ -176,13 +183,18 @@ fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
 /// Adds the views of another poses file; returns the number of drawings. `first`: the first file, for errors.
 fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, EncodeError> {
     let added = poses::read(path, None)?;
+    let (shown, first) = (path.display(), first.display());
     if added.applied != set.applied {
-        return Err(EncodeError::AddedFrame { first: first.to_owned(), path: path.to_owned() });
+        return Err(EncodeError::Failed(format!(
+            "{shown}: applied_transform or applied_scale differ from those of {first}; bring both poses into one frame"
+        )));
     }
     let known: HashSet<&str> = set.views.iter().map(|view| view.name.as_str()).collect();
     if let Some(view) = added.views.iter().find(|view| known.contains(view.name.as_str())) {
-        let view = view.name.clone();
-        return Err(EncodeError::AddedTwice { view, first: first.to_owned(), path: path.to_owned() });
+        return Err(EncodeError::Failed(format!(
+            "{shown}: view {} has a pose already in {first}; give the photos other names, or leave one of the files out",
+            view.name
+        )));
     }
     let n_drawn = ingest::drawn_from(path).map_or(0, |_| added.views.len());
     set.views.extend(added.views);
@@ -196,8 +208,10 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, Enco
 fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError> {
     for name in names {
         let Some(at) = views.iter().position(|view| view.name == *name) else {
-            let first = views.first().map(|view| view.name.clone()).unwrap_or_default();
-            return Err(EncodeError::NoViewToDrop { view: name.clone(), first });
+            let first = views.first().map_or("", |view| &view.name);
+            return Err(EncodeError::Failed(format!(
+                "--drop {name}: no poses file has this view; its first view is {first:?}"
+            )));
         };
         views.remove(at);
     }
@@ -213,8 +227,11 @@ fn find_views(
         ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
     let (gone, found): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| missing.contains(&v.name));
     if let (true, Some(first)) = (settings.run.strict, gone.first()) {
-        let first = first.image_path.clone();
-        return Err(EncodeError::MissingImages { n_missing: gone.len(), n_views, first });
+        return Err(EncodeError::Failed(format!(
+            "{} of {n_views} photos are missing, the first is {}; give their folder with --images",
+            gone.len(),
+            first.image_path.display()
+        )));
     }
     let skipped: Vec<SkippedView> = gone
         .into_iter()
@@ -228,7 +245,7 @@ fn find_views(
         .collect();
     if found.is_empty() {
         let reason = skipped.first().map_or("the poses file has none".into(), |s| s.reason.clone());
-        return Err(EncodeError::NoViews { n_views, reason });
+        return Err(EncodeError::no_views(n_views, &reason));
     }
     Ok((found, skipped))
 }

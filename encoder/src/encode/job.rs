@@ -132,10 +132,11 @@ impl Job {
         let of_path = |(_, id): &(&String, &Hash32)| stem.is_some_and(|stem| id.to_string() == stem);
         let Some((view, id)) = self.id_of_view.iter().find(of_path) else { return error.into() };
         match self.forget(*id) {
-            Ok(()) => {
-                let what = first_clause(source);
-                EncodeError::KeptView { view: view.clone(), path: path.clone(), what }
-            }
+            Ok(()) => EncodeError::Failed(format!(
+                "view {view}: {}: {}; run the same encode again: this view is made again, the others are kept",
+                path.display(),
+                first_clause(source)
+            )),
             Err(error) => error,
         }
     }

@@ -188,7 +188,10 @@ pub(crate) fn segmenter_of(
     } else if engines.models.patches_per_side().is_some() {
         Ok(Box::new(NoMasks))
     } else {
-        Err(EncodeError::NoPatches { model: engines.models.encoder_id().to_string() })
+        Err(EncodeError::Failed(format!(
+            "{} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out",
+            engines.models.encoder_id()
+        )))
     }
 }
 

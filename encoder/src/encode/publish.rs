@@ -33,7 +33,11 @@ pub(super) fn publish(
     if built.n_without_evidence >= n_gaussians as u64 && !plan.settings.run.allow_empty {
         let Counts { n_views_without_masks, n_masks, n_entries, .. } = built.counts;
         let n_views = views.used.len();
-        return Err(EncodeError::NoEvidence { n_views, n_views_without_masks, n_masks, n_entries });
+        return Err(EncodeError::Failed(format!(
+            "no Gaussian has an embedding, so nothing is published: {n_views} views ({n_views_without_masks} without masks) \
+             have {n_masks} masks and {n_entries} contributions; see whether masks, poses and splat fit with `slag-encoder \
+             check`, or publish it all the same with --allow-empty"
+        )));
     }
     warn_of_single_masks(&plan, &built.counts, views.used.len());
     let generation = plan.store.next_generation()?;

@@ -62,7 +62,7 @@ pub(super) fn run_views<'a>(plan: &Plan<'a>, executor: &dyn Executor) -> Result<
     let mut used: Vec<usize> = plan.order.iter().copied().filter(is_done).collect();
     used.sort_unstable();
     if let (true, Some(first)) = (used.is_empty(), skipped.first()) {
-        return Err(EncodeError::NoViews { n_views: skipped.len(), reason: first.reason.clone() });
+        return Err(EncodeError::no_views(skipped.len(), &first.reason));
     }
     let coverage = plan.coverage.as_ref().map(|coverage| coverage.report(used.iter().copied()));
     let used = used.into_iter().map(|view| &views[view]).collect();

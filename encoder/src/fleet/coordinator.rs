@@ -136,7 +136,7 @@ impl ViewsInWork<'_> {
             let FailedView { reason } = documents::parse(self.bucket, &key, &self.bucket.require(&key)?)?;
             let Some((_, view)) = self.open.remove(&id) else { continue };
             if is_strict {
-                return Err(FleetError::View { view, reason });
+                return Err(FleetError::Failed(format!("view {view}: {reason}")));
             }
             self.skipped.push(view, reason);
         }

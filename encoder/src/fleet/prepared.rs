@@ -60,10 +60,7 @@ impl Prepared {
             }
             (Masks::Sam { dir, .. }, _) => match segmenter {
                 Some(own) => dir.clone_from(own),
-                None => {
-                    let (planned, own) = (plan.engines.clone(), "no --segmenter".into());
-                    return Err(FleetError::Identity { run: run.0, planned, own });
-                }
+                None => return Err(other_engines(run, &plan.engines, "no --segmenter")),
             },
             (Masks::Auto { .. } | Masks::Graph, _) => {}
         }
@@ -107,11 +104,10 @@ impl Prepared {
             context.install(|| of_scene(&self.settings, cells, engines, segmenter, OF_A_FLEET, &self.scene));
         match found? == self.plan.of_scene {
             true => Ok(()),
-            false => Err(FleetError::Identity {
-                run: self.run.0,
-                planned: self.plan.engines.clone(),
-                own: engines_text(engines.models.encoder_id(), &segmenter.identity()),
-            }),
+            false => {
+                let own = engines_text(engines.models.encoder_id(), &segmenter.identity());
+                Err(other_engines(self.run, &self.plan.engines, &own))
+            }
         }
     }
 
@@ -141,8 +137,7 @@ fn planned_view(planned: &PlannedView, folder: &Path) -> Result<View, FleetError
     let is_inside = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
     let mut files = planned.masks.iter().chain([&planned.photo]);
     if !is_inside || files.any(|file| file.ending.contains(['/', '\\'])) {
-        let reason = "its name leads out of the folder of photos".into();
-        return Err(FleetError::View { view: name.clone(), reason });
+        return Err(FleetError::Failed(format!("view {name}: its name leads out of the folder of photos")));
     }
     let (name, image_path) = (name.clone(), photo_path(planned, folder));
     Ok(View { name, image_path, intrinsics: *intrinsics, camera_from_world: *camera_from_world })
@@ -202,6 +197,14 @@ pub(super) fn upload(bucket: &Bucket, plan: &Plan<'_>, open: &[usize]) -> Result
         data_set,
         views: views.into_iter().map(|(_, view)| view).collect(),
     })
+}
+
+fn other_engines(run: Run, planned: &str, own: &str) -> FleetError {
+    FleetError::Failed(format!(
+        "run {} was planned with {planned}, this worker would encode with {own} and make other contributions; give the worker \
+         the coordinator's --models, --segmenter, --provider and program",
+        run.0
+    ))
 }
 
 pub(super) fn engines_text(models: impl ToString, segmenter: &str) -> String {

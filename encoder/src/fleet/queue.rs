@@ -48,8 +48,12 @@ pub(crate) struct QueueSettings {
 
 impl QueueSettings {
     async fn connect(&self) -> Result<Context, FleetError> {
-        let refuse =
-            |problem: &dyn Display| FleetError::Queue { url: self.url.clone(), problem: problem.to_string() };
+        let refuse = |problem: &dyn Display| {
+            FleetError::Failed(format!(
+                "{}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials",
+                self.url
+            ))
+        };
         let mut options = ConnectOptions::new().name("slag-encoder");
         if let Some(path) = &self.credentials {
             options = options.credentials_file(path).await.map_err(|e| refuse(&e))?;

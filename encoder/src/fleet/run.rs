@@ -74,7 +74,11 @@ impl Run {
         let PlannedBy { program: planned } = documents::parse(bucket, &key, &bytes)?;
         let own = documents::own_version();
         if planned != own {
-            return Err(FleetError::Version { run: run.0, planned, own });
+            return Err(FleetError::Failed(format!(
+                "run {} was planned by slag-encoder {planned}, this is {own}: install the same program on all machines of the \
+                 fleet",
+                run.0
+            )));
         }
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }

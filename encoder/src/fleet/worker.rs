@@ -89,8 +89,11 @@ pub(crate) fn work(
         }
     }
     if report == WorkReport::default() && !context.is_cancelled() && Run::is_first(bucket)? {
-        let (url, secs) = (bucket.url.clone(), settings.patience.as_secs_f64());
-        return Err(FleetError::NoRun { url, secs });
+        return Err(FleetError::Failed(format!(
+            "{}: no encode began within {:.0} s; check --blobs, or wait longer with --wait",
+            bucket.url,
+            settings.patience.as_secs_f64()
+        )));
     }
     Ok(report)
 }

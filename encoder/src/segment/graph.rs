@@ -181,8 +181,7 @@ impl Segmenter for GraphSegmenter {
         let edges = raster.edges_by_weight(&self.settings, boundaries.as_deref());
         let n_pixels = raster.lab.len();
         let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(MIN_AREA_PX);
-        let image = Segmented { raster: &raster, boundaries: boundaries.as_deref(), min_area_px };
-        let compact_scale = image.boundaries.map(|_| COMPACT_SCALE);
+        let compact_scale = boundaries.as_ref().map(|_| COMPACT_SCALE);
         let levels: Vec<Labels> = (self.settings.scales.iter().copied().chain(compact_scale))
             .map(|scale| raster.components(&edges, scale * WEIGHT_STEPS, min_area_px))
             .collect();
@@ -192,7 +191,7 @@ impl Segmenter for GraphSegmenter {
         // The finest component of each pixel without a mask.
         let mut rest = finest.map_or(Vec::new(), |finest| finest.of_pixel.clone());
         for (level, labels) in levels.iter().enumerate() {
-            let kept = self.kept(&image, &levels[..level], labels);
+            let kept = self.kept(&raster, boundaries.as_deref(), min_area_px, &levels[..level], labels);
             let mut is_kept = vec![false; labels.area_px.len()];
             kept.iter().for_each(|(label, _)| is_kept[*label as usize] = true);
             let covered = labels.of_pixel.iter().map(|label| is_kept.get(*label as usize) == Some(&true));
@@ -215,17 +214,17 @@ impl Segmenter for GraphSegmenter {
     }
 }
 
-struct Segmented<'a> {
-    raster: &'a Raster,
-    boundaries: Option<&'a [f32]>,
-    min_area_px: u32,
-}
-
 impl GraphSegmenter {
     /// Components that become masks, with their labels: large enough, in no coarser level, and outlined by boundaries.
     /// Compact ones need fewer of these; of the scale finer than all levels, only compact ones count.
-    fn kept(&self, image: &Segmented<'_>, coarser: &[Labels], labels: &Labels) -> Vec<(u32, Mask)> {
-        let &Segmented { raster, boundaries, min_area_px } = image;
+    fn kept(
+        &self,
+        raster: &Raster,
+        boundaries: Option<&[f32]>,
+        min_area_px: u32,
+        coarser: &[Labels],
+        labels: &Labels,
+    ) -> Vec<(u32, Mask)> {
         let n_components = labels.area_px.len();
         let repeats = labels.repeats_of(coarser, self.settings.max_overlap_iou);
         let support = boundaries.map(|boundaries| {
@@ -250,15 +249,11 @@ impl GraphSegmenter {
         if masks.len() <= self.settings.max_masks {
             return;
         }
-        let mut order: Vec<usize> = (0..masks.len()).collect();
-        order.sort_by_key(|index| (std::cmp::Reverse(masks[*index].area_px), *index));
-        let mut keep = vec![false; masks.len()];
-        order.iter().take(self.settings.max_masks).for_each(|index| keep[*index] = true);
-        let mut index = 0;
-        masks.retain(|_| {
-            index += 1;
-            keep[index - 1]
-        });
+        let mut numbered: Vec<(usize, Mask)> = std::mem::take(masks).into_iter().enumerate().collect();
+        numbered.sort_by_key(|(_, mask)| std::cmp::Reverse(mask.area_px));
+        numbered.truncate(self.settings.max_masks);
+        numbered.sort_by_key(|(number, _)| *number);
+        masks.extend(numbered.into_iter().map(|(_, mask)| mask));
     }
 }
 
@@ -629,43 +624,30 @@ mod tests {
         boundaries
     }
 
-    fn support(of_pixel: &[u32], boundaries: &[f32]) -> Vec<f32> {
-        of_outlines(of_pixel, SIDE, 2, boundaries)
+    /// Support of both components where boundaries are those of `predicted` that `seen` says.
+    fn support(of_pixel: &[u32], predicted: &[u32], seen: impl Fn(usize, usize) -> bool) -> [f32; 2] {
+        let found = of_outlines(of_pixel, SIDE, 2, &boundaries(predicted, seen));
+        [found[0], found[1]]
     }
 
+    /// By hand. A pixel without a component has no outline of its own.
     #[test]
     fn the_share_of_the_outline_that_is_predicted() {
-        let of_pixel = square(2, 2);
-        assert_eq!(support(&of_pixel, &boundaries(&of_pixel, |_, _| true)), [1.0, 1.0]);
-        assert_eq!(support(&of_pixel, &boundaries(&of_pixel, |_, _| false)), [0.0, 0.0]);
+        let middle = square(2, 2);
+        assert_eq!(support(&middle, &middle, |_, _| true), [1.0, 1.0]);
+        assert_eq!(support(&middle, &middle, |_, _| false), [0.0, 0.0]);
         // Without its right side, whose pairs begin in column 5; none of these is beside a pair of another side of its
-        // kind.
-        let three_sides = support(&of_pixel, &boundaries(&of_pixel, |x, y| x != 5 || !(2..6).contains(&y)));
-        // The bottom's last pair begins in that column, too, but its neighbour is predicted.
-        assert_eq!(three_sides, [0.75, 0.75]);
-    }
-
-    #[test]
-    fn the_edge_of_the_photo_is_no_outline() {
-        // Two sides lie on the photo's edge.
-        let of_pixel = square(4, 4);
-        assert_eq!(support(&of_pixel, &boundaries(&of_pixel, |_, _| true)), [1.0, 1.0]);
-        assert_eq!(support(&[0; SIDE * SIDE], &vec![0.0; 4 * SIDE * SIDE])[0], 1.0);
-    }
-
-    #[test]
-    fn a_boundary_may_be_a_pixel_off_but_not_two() {
-        let [of_pixel, shifted, far] = [square(2, 2), square(3, 2), square(4, 2)];
-        let [near, far] = [shifted, far].map(|other| support(&of_pixel, &boundaries(&other, |_, _| true))[1]);
-        assert_eq!(near, 1.0);
-        assert!(far < 0.5, "{far}");
-    }
-
-    #[test]
-    fn pixels_without_a_component_have_no_outline_of_their_own() {
-        let mut of_pixel = square(2, 2);
-        of_pixel[0] = NO_REGION;
-        let found = support(&of_pixel, &boundaries(&of_pixel, |_, _| true));
-        assert_eq!(found, [1.0, 1.0]);
+        // kind. The bottom's last pair begins in that column, too, but its neighbour is predicted.
+        assert_eq!(support(&middle, &middle, |x, y| x != 5 || !(2..6).contains(&y)), [0.75, 0.75]);
+        let mut without = middle.clone();
+        without[0] = NO_REGION;
+        assert_eq!(support(&without, &without, |_, _| true), [1.0, 1.0]);
+        // Two sides lie on the photo's edge, which is no outline.
+        let corner = square(4, 4);
+        assert_eq!(support(&corner, &corner, |_, _| true), [1.0, 1.0]);
+        assert_eq!(support(&[0; SIDE * SIDE], &[0; SIDE * SIDE], |_, _| true)[0], 1.0);
+        // A boundary may be a pixel off, but not two.
+        assert_eq!(support(&middle, &square(3, 2), |_, _| true)[1], 1.0);
+        assert!(support(&middle, &square(4, 2), |_, _| true)[1] < 0.5);
     }
 }

@@ -5,19 +5,17 @@ mod graph;
 mod sam;
 mod standing;
 
-use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::{fmt, io};
 
 use image::RgbImage;
 use rayon::ThreadPool;
-use slag_common::files::NotUtf8;
 use slag_common::{Hash32, View};
 use slag_models::session::SessionError;
 
 use crate::ingest::{LoadedImage, Undistorter};
 use crate::lanes::GpuLoad;
 use crate::masks::Mask;
-use crate::masks::rle::RleError;
 
 pub use given::{GivenMasks, file_of as mask_file};
 pub use graph::{GraphSegmenter, GraphSettings};
@@ -116,79 +114,24 @@ impl Segmenter for NoMasks {
 pub enum SegmentError {
     #[error("{0}; check that the file exists and may be read")]
     Io(#[from] io::Error),
-    #[error("{}: {source}; write the mask image again", path.display())]
-    Png {
-        path: PathBuf,
-        #[source]
-        source: png::DecodingError,
-    },
-    #[error("{}: found {found} pixels, expected ids; write a PNG with up to 16 bits of gray, or with a palette", path.display())]
-    NotIds { path: PathBuf, found: &'static str },
-    #[error(
-        "{}: soft edges: {n} values between black and white lie only where they meet, expected an id for each mask; write black \
-         where a pixel is outside, white where it is inside, nothing between", path.display()
-    )]
-    SoftEdges { path: PathBuf, n: usize },
-    #[error("{}: {what}; {advice}", path.display())]
-    StandIn { path: PathBuf, what: &'static str, advice: &'static str },
-    #[error(
-        "{}: {source}; expected SAM's list of masks, each with segmentation {{size, counts}}, or a COCO data set",
-        path.display()
-    )]
-    Json {
-        path: PathBuf,
-        #[source]
-        source: serde_json::Error,
-    },
-    #[error("{}: {source}", path.display())]
-    Text {
-        path: PathBuf,
-        #[source]
-        source: NotUtf8,
-    },
-    #[error("{}: {what}; correct it, or export the data set again", path.display())]
-    DataSet { path: PathBuf, what: String },
-    #[error(
-        "{}: it may have the masks of {first:?} or of {second:?}; name each file of masks after all of its photo's name, such \
-         as {first}.png",
-        path.display()
-    )]
-    TwoPhotos { path: PathBuf, first: String, second: String },
-    #[error("{}: mask {index}: {source}", path.display())]
-    Rle {
-        path: PathBuf,
-        index: usize,
-        #[source]
-        source: RleError,
-    },
+    /// What is wrong with a file of masks, and what to do.
+    #[error("{}: {problem}", path.display())]
+    File { path: PathBuf, problem: String },
+    #[error("view {view}: {problem}")]
+    View { view: String, problem: String },
     #[error(
         "{}: the masks have {} x {} px but the photo of view {view:?} {} x {} px; make the masks from the same photos",
         path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1]
     )]
     Size { path: PathBuf, view: String, found_px: [u32; 2], expected_px: [u32; 2] },
-    #[error(
-        "{}: the bounding boxes of the masks exceed {limit_bytes} px in total; remove stray pixels or give fewer masks",
-        path.display()
-    )]
-    TooLarge { path: PathBuf, limit_bytes: u64 },
-    #[error(
-        "{}: no masks of any photo: for {view:?} expected a file of that name with the ending .png or .json (or a folder with \
-         0.png, 1.png ...), or a COCO file_name like it; found {found}{hint}", path.display()
-    )]
-    NoMatch { path: PathBuf, view: String, found: String, hint: &'static str },
-    #[error("{}: {n} of {of} photos have no masks, the first is {view:?}; make them, or leave out --strict", path.display())]
-    Missing { path: PathBuf, view: String, n: usize, of: usize },
     #[error(transparent)]
     Model(Box<SessionError>),
-    #[error(
-        "view {view}: the mask model's output is not finite; run it with --provider cpu, or give another"
-    )]
-    NotFinite { view: String },
-    #[error(
-        "view {view}: the masks found exceed {limit_bytes} bytes; lower --points-per-side, or raise \
-         --sam-predicted-iou and --sam-stability"
-    )]
-    TooManyMasks { view: String, limit_bytes: u64 },
+}
+
+impl SegmentError {
+    fn of_file(path: &Path, problem: impl fmt::Display) -> Self {
+        Self::File { path: path.to_owned(), problem: problem.to_string() }
+    }
 }
 
 impl From<SessionError> for SegmentError {

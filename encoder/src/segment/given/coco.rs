@@ -59,20 +59,20 @@ pub(super) fn read_list(path: &Path) -> Result<Vec<(usize, Rle)>, SegmentError> 
 fn parse(path: &Path) -> Result<MaskFile, SegmentError> {
     let mut bytes = Vec::new();
     files::open(path)?.read_to_end(&mut bytes)?;
-    let text = files::text_of(&bytes);
-    let text = text.map_err(|source| SegmentError::Text { path: path.to_owned(), source })?;
+    let text = files::text_of(&bytes).map_err(|error| SegmentError::of_file(path, error))?;
     let parsed = if text.trim_start().starts_with('[') {
         serde_json::from_str(text).map(|annotations| MaskFile { images: Vec::new(), annotations })
     } else {
         serde_json::from_str(text)
     };
-    parsed.map_err(|source| SegmentError::Json { path: path.to_owned(), source })
+    let expected = "expected SAM's list of masks, each with segmentation {size, counts}, or a COCO data set";
+    parsed.map_err(|error| SegmentError::of_file(path, format!("{error}; {expected}")))
 }
 
 fn rles_of(path: &Path, annotations: Vec<Annotation>) -> Result<Vec<(usize, Rle)>, SegmentError> {
     let rle = |(index, annotation): (usize, Annotation)| match rle_of(annotation.segmentation) {
         Ok(rle) => Ok((index, rle)),
-        Err(source) => Err(SegmentError::Rle { path: path.to_owned(), index, source }),
+        Err(error) => Err(SegmentError::of_file(path, format!("mask {index}: {error}"))),
     };
     annotations.into_iter().enumerate().map(rle).collect()
 }
@@ -89,10 +89,14 @@ fn rle_of(segmentation: Segmentation) -> Result<Rle, RleError> {
     }
 }
 
+pub(super) fn inconsistent(path: &Path, what: &str) -> SegmentError {
+    SegmentError::of_file(path, format!("{what}; correct it, or export the data set again"))
+}
+
 pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     let MaskFile { images, annotations } = parse(path)?;
     let image_ids: Vec<Option<u64>> = annotations.iter().map(|annotation| annotation.image_id).collect();
-    let inconsistent = |what: String| SegmentError::DataSet { path: path.to_owned(), what };
+    let inconsistent = |what: String| inconsistent(path, &what);
     let mut rles_of_id: BTreeMap<u64, Vec<(usize, Rle)>> = BTreeMap::new();
     for image in &images {
         if rles_of_id.insert(image.id, Vec::new()).is_some() {
@@ -213,7 +217,9 @@ pub(super) fn undistorted(
 }
 
 pub(super) fn too_large(path: &Path) -> SegmentError {
-    SegmentError::TooLarge { path: path.to_owned(), limit_bytes: MAX_MASK_BYTES }
+    let advice = "remove stray pixels or give fewer masks";
+    let problem = format!("the bounding boxes of the masks exceed {MAX_MASK_BYTES} px in total; {advice}");
+    SegmentError::of_file(path, problem)
 }
 
 pub(super) fn check_size(
@@ -257,12 +263,12 @@ pub(super) fn n_soft(ids: &[u32], width: usize) -> Option<usize> {
 
 /// Ids of a PNG of the photo's size, row-major; of a palette, the indices.
 pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>, SegmentError> {
-    let failed = |source| SegmentError::Png { path: path.to_owned(), source };
+    let failed = |error| SegmentError::of_file(path, format!("{error}; write the mask image again"));
     let n_pixels = input.image.width() as usize * input.image.height() as usize;
     let limits = png::Limits { bytes: 2 * n_pixels + PNG_OVERHEAD_BYTES };
     let mut file = BufReader::new(files::open(path)?);
     if let Some((what, advice)) = files::stand_in(file.fill_buf()?) {
-        return Err(SegmentError::StandIn { path: path.to_owned(), what, advice });
+        return Err(SegmentError::of_file(path, format!("{what}; {advice}")));
     }
     let mut decoder = png::Decoder::new_with_limits(file, limits);
     decoder.set_transformations(png::Transformations::IDENTITY);
@@ -270,14 +276,15 @@ pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>
     check_size(path, [width_px, height_px], input)?;
     let mut reader = decoder.read_info().map_err(failed)?;
     let (color, depth) = reader.output_color_type();
-    let found = match color {
+    let other = match color {
         png::ColorType::Grayscale | png::ColorType::Indexed => None,
         png::ColorType::Rgb => Some("RGB"),
         png::ColorType::GrayscaleAlpha => Some("gray and alpha"),
         png::ColorType::Rgba => Some("RGBA"),
     };
-    if let Some(found) = found {
-        return Err(SegmentError::NotIds { path: path.to_owned(), found });
+    if let Some(other) = other {
+        let advice = "write a PNG with up to 16 bits of gray, or with a palette";
+        return Err(SegmentError::of_file(path, format!("found {other} pixels, expected ids; {advice}")));
     }
     // Bounded: at most 16 bits per pixel of the photo's size.
     let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(0)];

@@ -98,7 +98,9 @@ impl SamSegmenter {
                 let mut left_bytes = MAX_MASK_BYTES;
                 for decoded in receiver {
                     if !input.install(|| filter::is_finite(&decoded)) {
-                        return Err(SegmentError::NotFinite { view: input.view.name.clone() });
+                        let advice = "run it with --provider cpu, or give another";
+                        let problem = format!("the mask model's output is not finite; {advice}");
+                        return Err(SegmentError::View { view: input.view.name.clone(), problem });
                     }
                     let upsampler = Upsampler::new(letterbox, decoded.logits_px);
                     let candidates = input.install(|| filters.candidates(&decoded, &upsampler, crop));
@@ -123,7 +125,9 @@ impl SamSegmenter {
 }
 
 fn too_many(input: &SegmentInput<'_>) -> SegmentError {
-    SegmentError::TooManyMasks { view: input.view.name.clone(), limit_bytes: MAX_MASK_BYTES }
+    let advice = "lower --points-per-side, or raise --sam-predicted-iou and --sam-stability";
+    let problem = format!("the masks found exceed {MAX_MASK_BYTES} bytes; {advice}");
+    SegmentError::View { view: input.view.name.clone(), problem }
 }
 
 impl Segmenter for SamSegmenter {
