@@ -199,7 +199,7 @@ fn thumbnails(
 fn put_extras(plan: &Plan<'_>, table: &RegionTable) -> Result<Extras, EncodeError> {
     let Plan { store, settings, .. } = *plan;
     let mut extras = Extras::new();
-    if settings.aggregation != Aggregation::PLAIN {
+    if settings.aggregation != Aggregation::default() {
         let record = serde_json::to_vec(&settings.aggregation).map_err(std::io::Error::from)?;
         extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
     }

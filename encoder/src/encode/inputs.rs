@@ -560,6 +560,6 @@ mod tests {
         ];
         assert!(changed.iter().all(|identity| *identity != plain));
         // Later steps are no part of the identity.
-        assert_eq!(with(&|settings, _| settings.aggregation = crate::lift::Aggregation::PLAIN), plain);
+        assert_eq!(with(&|settings, _| settings.aggregation = crate::lift::Aggregation::default()), plain);
     }
 }

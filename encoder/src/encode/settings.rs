@@ -384,7 +384,7 @@ impl Preset {
             Self::Balanced => {}
             Self::Plain => {
                 view.regions = Regions::Crops;
-                *aggregation = Aggregation::PLAIN;
+                *aggregation = Aggregation::default();
                 cells.objects = false;
             }
             // Section "Settings" of the paper (IEEE RA-L 2025): grid 16, whole level, ScanNet's raster of 648 x 484.
@@ -394,7 +394,7 @@ impl Preset {
                 view.min_mask_px = 1;
                 view.merges_slivers = false;
                 view.raster_width = RasterWidth::Px(648);
-                *aggregation = Aggregation::PLAIN;
+                *aggregation = Aggregation::default();
                 cells.objects = false;
             }
             Self::Fast => {

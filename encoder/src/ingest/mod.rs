@@ -86,17 +86,8 @@ pub enum IngestError {
     Io(#[from] io::Error),
     #[error("{}: {fault}", path.display())]
     Photo { path: PathBuf, fault: PhotoError },
-    #[error(
-        "{}: nothing of it is seen: it is transparent, or the camera's lens distortion leaves no pixel; give another \
-         copy, or leave the photo out",
-        path.display()
-    )]
-    Blank { path: PathBuf },
-    #[error(
-        "{}: {} x {} px take {needed} while they are loaded, and {free} are free; give smaller copies",
-        path.display(), size_px[0], size_px[1]
-    )]
-    TooLarge { path: PathBuf, size_px: [u32; 2], needed: ByteSize, free: ByteSize },
+    #[error("{}: {problem}", path.display())]
+    File { path: PathBuf, problem: String },
     #[error(
         "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other, 1/{MAX_DOWNSCALE} to {MAX_UPSCALE}; \
          give the images that the poses were computed from, or whole-factor reductions of them",
@@ -149,8 +140,12 @@ pub fn check_memory(view: &View, free_bytes: u64) -> Result<(), IngestError> {
     if needed_bytes <= free_bytes {
         return Ok(());
     }
-    let (path, size_px) = (view.image_path.clone(), photo_size_px(view));
-    Err(IngestError::TooLarge { path, size_px, needed: ByteSize(needed_bytes), free: ByteSize(free_bytes) })
+    let ([width_px, height_px], needed, free) =
+        (photo_size_px(view), ByteSize(needed_bytes), ByteSize(free_bytes));
+    let problem = format!(
+        "{width_px} x {height_px} px take {needed} while they are loaded, and {free} are free; give smaller copies"
+    );
+    Err(IngestError::File { path: view.image_path.clone(), problem })
 }
 
 /// Loads the photo of a view and undistorts it.
@@ -165,7 +160,9 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
     let or_blank = |loaded: LoadedImage| match &loaded.valid {
         Some(valid) if !valid.contains(&true) => {
-            Err(IngestError::Blank { path: loaded.view.image_path.clone() })
+            let problem = "nothing of it is seen: it is transparent, or the camera's lens distortion leaves no pixel; give \
+                           another copy, or leave the photo out";
+            Err(IngestError::File { path: loaded.view.image_path.clone(), problem: problem.into() })
         }
         _ => Ok(loaded),
     };

@@ -105,20 +105,8 @@ impl fmt::Display for FoundFrame {
 pub enum GeoError {
     #[error("{0}; check that the file exists and may be read")]
     Io(#[from] io::Error),
-    #[error(r#"{}: {source}; expected {{"origin": {{"lat": DEGREES, "lon": DEGREES, "alt": METRES}}}}"#, path.display())]
-    Json {
-        path: PathBuf,
-        #[source]
-        source: serde_json::Error,
-    },
-    #[error("{}: {source}", path.display())]
-    Text {
-        path: PathBuf,
-        #[source]
-        source: files::NotUtf8,
-    },
-    #[error("{}: origin.{field} = {value} is outside {min}..={max}; write degrees and metres of WGS 84", path.display())]
-    Range { path: PathBuf, field: &'static str, value: f64, min: f64, max: f64 },
+    #[error("{}: {problem}", path.display())]
+    File { path: PathBuf, problem: String },
 }
 
 #[derive(Deserialize)]
@@ -139,9 +127,10 @@ const MAX_BYTES: u64 = 1 << 20;
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let mut bytes = Vec::new();
     files::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
-    let text = files::text_of(&bytes);
-    let text = text.map_err(|source| GeoError::Text { path: path.to_owned(), source })?;
-    let malformed = |source| GeoError::Json { path: path.to_owned(), source };
+    let wrong = |problem: String| GeoError::File { path: path.to_owned(), problem };
+    let text = files::text_of(&bytes).map_err(|error| wrong(error.to_string()))?;
+    let expected = r#"expected {"origin": {"lat": DEGREES, "lon": DEGREES, "alt": METRES}}"#;
+    let malformed = |error: serde_json::Error| wrong(format!("{error}; {expected}"));
     // Maps first, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's; then structs, since a map
     // would take a name twice.
     let maps: HashMap<String, Value> = serde_json::from_str(text).map_err(malformed)?;
@@ -151,7 +140,9 @@ pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let GeoFile { origin } = serde_json::from_str(text).map_err(malformed)?;
     let range = |field: &'static str, value: f64, min: f64, max: f64| match (min..=max).contains(&value) {
         true => Ok(value),
-        false => Err(GeoError::Range { path: path.to_owned(), field, value, min, max }),
+        false => Err(wrong(format!(
+            "origin.{field} = {value} is outside {min}..={max}; write degrees and metres of WGS 84"
+        ))),
     };
     // Heights range from the deepest trench to the edge of space.
     let latitude_deg = range("lat", origin.lat, -90.0, 90.0)?;

@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use rayon::prelude::*;
-use slag_common::container::ContainerError;
 
 use super::contributions::{ContributionError, ContributionFile, GAUSSIANS_PER_SLICE, PackedEntry, Run};
 use super::table::RegionTable;
@@ -233,9 +232,7 @@ impl ContributionIndex {
 }
 
 fn of_another_scene(path: &Path) -> ContributionError {
-    let what = "the contributions belong to another scene or model".into();
-    let source = ContainerError::Damaged { offset_bytes: 0, what };
-    ContributionError::Damaged { path: path.to_owned(), source }
+    ContributionError::damaged(path, "the contributions belong to another scene or model".into())
 }
 
 fn part_bytes(part: &Part) -> u64 {
@@ -344,7 +341,11 @@ impl ContributionIndex {
             match task.starts.get_mut(gaussian) {
                 Some(end) => *end = task.first_entry + u64::from(at),
                 None if n == 0 => {}
-                None => return Err(foreign_gaussian(&self.views[task.runs[0].0].file.path, gaussian)),
+                None => {
+                    let what =
+                        format!("a contribution of Gaussian {gaussian} to a slice with fewer Gaussians");
+                    return Err(ContributionError::damaged(&self.views[task.runs[0].0].file.path, what));
+                }
             }
         }
         let mut totals = [0.0f64; GAUSSIANS_PER_SLICE];
@@ -362,10 +363,4 @@ impl ContributionIndex {
         task.total_weights.iter_mut().zip(totals).for_each(|(out, total)| *out = total as f32);
         Ok(())
     }
-}
-
-fn foreign_gaussian(path: &Path, in_slice: usize) -> ContributionError {
-    let what = format!("a contribution of Gaussian {in_slice} to a slice with fewer Gaussians");
-    let source = ContainerError::Damaged { offset_bytes: 0, what };
-    ContributionError::Damaged { path: path.to_owned(), source }
 }

@@ -164,8 +164,8 @@ impl Superpoints {
     }
 
     /// Bytes to partition `n_gaussians` at `n_scales` at once: neighbours during the search, then with edges and joins.
-    pub(crate) fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
-        let n = settings.n_neighbours;
+    pub(crate) fn working_bytes(n_gaussians: usize, n_scales: usize) -> u64 {
+        let n = SuperpointSettings::default().n_neighbours;
         let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);
         let of_one = size_of::<Look>() + (1 + 5 * n_scales) * size_of::<u32>();
         let joined = n * (size_of::<u32>() + size_of::<Edge>()) + of_one;

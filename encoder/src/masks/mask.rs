@@ -20,6 +20,25 @@ impl BoxPx {
     pub fn height_px(&self) -> u32 {
         self.y1 - self.y0
     }
+
+    pub(crate) fn area_px(&self) -> u64 {
+        u64::from(self.width_px()) * u64::from(self.height_px())
+    }
+
+    /// Place of a pixel in the box, row-major.
+    pub(crate) fn place_of(&self, x: u32, y: u32) -> usize {
+        (y - self.y0) as usize * self.width_px() as usize + (x - self.x0) as usize
+    }
+
+    /// The smallest box around both.
+    pub(crate) fn join(self, other: Self) -> Self {
+        Self {
+            x0: self.x0.min(other.x0),
+            y0: self.y0.min(other.y0),
+            x1: self.x1.max(other.x1),
+            y1: self.y1.max(other.y1),
+        }
+    }
 }
 
 /// A set of pixels of an image; masks may overlap.
@@ -41,7 +60,7 @@ impl Mask {
 
     /// All pixels of a box, level 0.
     pub fn whole(box_px: BoxPx) -> Self {
-        let area_px = box_px.width_px() * box_px.height_px();
+        let area_px = box_px.area_px() as u32;
         Self { box_px, inside: Bits::of(true, area_px as usize), area_px, level: 0 }
     }
 
@@ -57,9 +76,7 @@ impl Mask {
 
     pub fn contains(&self, x: u32, y: u32) -> bool {
         let BoxPx { x0, y0, x1, y1 } = self.box_px;
-        (x0..x1).contains(&x)
-            && (y0..y1).contains(&y)
-            && self.inside.get((y - y0) as usize * self.box_px.width_px() as usize + (x - x0) as usize)
+        (x0..x1).contains(&x) && (y0..y1).contains(&y) && self.inside.get(self.box_px.place_of(x, y))
     }
 }
 
@@ -84,8 +101,7 @@ pub fn masks_of_labels(
             *area_px += 1;
         }
     }
-    let box_area_px = |b: &BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
-    let total_px: u64 = boxes.iter().filter(|(_, area)| *area > 0).map(|(b, _)| box_area_px(b)).sum();
+    let total_px: u64 = boxes.iter().filter(|(_, area)| *area > 0).map(|(b, _)| b.area_px()).sum();
     if total_px > limit_px {
         return None;
     }
@@ -93,15 +109,13 @@ pub fn masks_of_labels(
     let mut masks = Vec::new();
     for ((box_px, area_px), label) in boxes.into_iter().zip(0_u32..).filter(|((_, area), _)| *area > 0) {
         slot_of_label[label as usize] = masks.len();
-        let inside = Bits::of(false, box_area_px(&box_px) as usize);
+        let inside = Bits::of(false, box_px.area_px() as usize);
         masks.push((label, Mask { box_px, inside, area_px, level: 0 }));
     }
     for (row, y) in rows() {
         for (label, x) in row.iter().zip(0_u32..).filter(|(label, _)| **label != NO_REGION) {
             let mask = &mut masks[slot_of_label[*label as usize]].1;
-            let at = (y - mask.box_px.y0) as usize * mask.box_px.width_px() as usize
-                + (x - mask.box_px.x0) as usize;
-            mask.inside.set(at, true);
+            mask.inside.set(mask.box_px.place_of(x, y), true);
         }
     }
     Some(masks)

@@ -19,7 +19,7 @@ use slag_math::dot;
 
 use crate::codebook::ScoreMetricContext;
 use crate::lift::RegionTable;
-use crate::lift::superpoint::{NO_SUPERPOINT, SuperpointSettings, Superpoints};
+use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::memory::{MemoryPlan, Phase};
 use crate::progress::FoundObject;
 
@@ -33,7 +33,7 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, has_superpoin
     memory.reserve(Phase::Always, "the object of each Gaussian", labels_bytes);
     tree::reserve(memory, n_gaussians);
     if !has_superpoints {
-        let len_bytes = Superpoints::working_bytes(n_gaussians, 1, &SuperpointSettings::default());
+        let len_bytes = Superpoints::working_bytes(n_gaussians, 1);
         memory.reserve(Phase::Objects, "superpoints of all Gaussians", len_bytes + labels_bytes);
     }
 }

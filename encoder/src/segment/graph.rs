@@ -475,10 +475,9 @@ fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
     };
     let ((x0, x1), (y0, y1)) =
         (range(columns, mask.box_px.x0, mask.box_px.x1), range(rows, mask.box_px.y0, mask.box_px.y1));
-    let of_row = |row: &u32| {
-        let start = (row - mask.box_px.y0) as usize * mask.box_px.width_px() as usize;
-        let columns = &columns[x0 as usize..x1 as usize];
-        columns.iter().map(move |column| mask.inside.get(start + (column - mask.box_px.x0) as usize))
+    let of_row = |y: &u32| {
+        let columns = columns[x0 as usize..x1 as usize].iter();
+        columns.map(|x| mask.inside.get(mask.box_px.place_of(*x, *y))).collect::<Vec<bool>>()
     };
     let inside: Bits = rows[y0 as usize..y1 as usize].iter().flat_map(of_row).collect();
     let area_px = inside.count() as u32;

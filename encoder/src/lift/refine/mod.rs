@@ -2,8 +2,8 @@
 //!
 //! | file | field of [`Aggregation`] | effect |
 //! |---|---|---|
-//! | `mod` | `truncation_power` | masks that the photo's edge cuts off count less |
-//! | `prune` | `min_view_share` | contributions of a view that hardly shows the Gaussian are dropped |
+//! | this | `truncation_power` | masks that the photo's edge cuts off count less |
+//! | this | `min_view_share` | contributions of a view that hardly shows the Gaussian are dropped |
 //! | `mixture` | `superpoint`, `coarse`, `object` | a Gaussian takes a share of its superpoint, then of a larger one, then of its object |
 //! | `mixture` | `fill` | a Gaussian without evidence takes its superpoint's mean |
 //!
@@ -17,7 +17,7 @@
 
 use std::ops::Range;
 
-use mixture::{AXES, Mixtures, PartSums, Point, SuperpointSums};
+use mixture::{AXES, Mixtures, Point, Sums};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use slag_math::axes::principal_coordinates;
@@ -188,14 +188,16 @@ impl Refinement {
         mask_points: &[Point],
         scales: Vec<(f32, Superpoints)>,
     ) -> Result<(), ContributionError> {
-        let mut sums: Vec<SuperpointSums> = scales.iter().map(|(_, of)| SuperpointSums::new(of.n)).collect();
-        let of_part = |mut contributions: PartContributions| -> Vec<PartSums> {
+        let mut sums: Vec<Vec<Sums>> = scales.iter().map(|(_, of)| vec![Vec::new(); of.n]).collect();
+        let of_part = |mut contributions: PartContributions| -> Vec<Vec<(usize, Sums)>> {
             self.prune(&mut contributions);
             let gaussians = contributions.part.gaussians(scene.split);
-            scales.iter().map(|(_, of)| PartSums::new(&contributions, gaussians, of)).collect()
+            scales.iter().map(|(_, of)| mixture::part_sums(&contributions, gaussians, of)).collect()
         };
         scene.visit(table, of_part, |of_part| {
-            sums.iter_mut().zip(of_part).for_each(|(sums, of_part)| sums.add(of_part));
+            for (sums, of_part) in sums.iter_mut().zip(of_part) {
+                of_part.into_iter().for_each(|(superpoint, entries)| sums[superpoint].extend(entries));
+            }
         })?;
         for ((weight, superpoints), sums) in scales.into_iter().zip(sums) {
             self.mixtures.push(Mixtures::new(weight, superpoints, sums, table, mask_points)?);
@@ -212,8 +214,7 @@ impl Refinement {
         let n_scales = settings.n_scales();
         if settings.needs_superpoints() {
             let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
-            let graph_bytes =
-                Superpoints::working_bytes(n_gaussians, n_scales, &SuperpointSettings::default());
+            let graph_bytes = Superpoints::working_bytes(n_gaussians, n_scales);
             memory.reserve(Phase::Superpoints, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
         }
         let labels_bytes = |n_partitions: usize| (n_gaussians * n_partitions * size_of::<u32>()) as u64;
@@ -230,11 +231,11 @@ impl Refinement {
         n_regions: usize,
         n_entries: u64,
     ) {
-        if *settings != Aggregation::PLAIN {
+        if *settings != Aggregation::default() {
             let len_bytes = n_regions * (size_of::<Point>() + size_of::<f32>());
             memory.reserve(Phase::Always, "vectors of regions", len_bytes as u64);
         }
-        let sums_bytes = SuperpointSums::len_bytes(n_entries) * settings.n_partitions() as u64;
+        let sums_bytes = mixture::sums_bytes(n_entries) * settings.n_partitions() as u64;
         memory.reserve(Phase::Refine, "sums of superpoints", sums_bytes);
     }
 
@@ -271,15 +272,6 @@ pub struct Aggregation {
 }
 
 impl Aggregation {
-    /// The paper's weighted average.
-    pub const PLAIN: Self = Self {
-        min_view_share: 0.0,
-        truncation_power: 0.0,
-        superpoint: 0.0,
-        coarse: 0.0,
-        object: 0.0,
-        fill: false,
-    };
     /// The refinements that help on both trained and generated splats (docs/decisions.md). Larger shares of superpoints
     /// smooth small things away.
     pub(crate) const REFINED: Self = Self {

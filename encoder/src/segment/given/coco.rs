@@ -10,7 +10,7 @@ use slag_common::files;
 use crate::ingest::Undistorter;
 use crate::masks::regions::partition;
 use crate::masks::rle::{Rle, RleError};
-use crate::masks::{Bits, BoxPx, Mask, NO_REGION};
+use crate::masks::{Bits, BoxPx, Mask, NO_REGION, masks_of_labels};
 use crate::segment::{MAX_MASK_BYTES, SegmentError, SegmentInput};
 
 /// By file name, with indices in the file.
@@ -152,8 +152,7 @@ pub(super) fn masks_of_rles(
     for (_, rle) in rles {
         check_size(path, rle.size_px(), input)?;
         let Some(box_px) = rle.box_px() else { continue };
-        let bytes = u64::from(box_px.width_px()) * u64::from(box_px.height_px());
-        left_bytes = left_bytes.checked_sub(bytes).ok_or_else(|| too_large(path))?;
+        left_bytes = left_bytes.checked_sub(box_px.area_px()).ok_or_else(|| too_large(path))?;
         masks.extend(rle.to_mask());
     }
     Ok(match input.undistorter {
@@ -172,48 +171,23 @@ pub(super) fn undistorted(
 ) -> Vec<Mask> {
     let (map, masks_of_region) = partition(masks, width_px, height_px, width_px, height_px, None);
     let labels = undistorter.labels(&map.region_of_pixel, NO_REGION);
-    let covered = || {
-        let with_position = labels.iter().zip(0_u32..).filter(|(region, _)| **region != NO_REGION);
-        with_position.map(|(region, at)| (*region as usize, at % width_px, at / width_px))
-    };
-
-    let empty = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
-    let join = |a: BoxPx, b: BoxPx| BoxPx {
-        x0: a.x0.min(b.x0),
-        y0: a.y0.min(b.y0),
-        x1: a.x1.max(b.x1),
-        y1: a.y1.max(b.y1),
-    };
-    let mut boxes = vec![(empty, 0); map.n_regions as usize];
-    for (region, x, y) in covered() {
-        let (box_px, area_px) = &mut boxes[region];
-        *box_px = join(*box_px, BoxPx { x0: x, y0: y, x1: x + 1, y1: y + 1 });
-        *area_px += 1;
+    let regions = masks_of_labels(&labels, width_px, map.n_regions as usize, u64::MAX).unwrap_or_default();
+    let mut parts_of_mask: Vec<Vec<&Mask>> = vec![Vec::new(); masks.len()];
+    for (region, part) in &regions {
+        masks_of_region[*region as usize].iter().for_each(|mask| parts_of_mask[*mask as usize].push(part));
     }
-    let mut ideal: Vec<Mask> = masks
-        .iter()
-        .map(|mask| Mask { box_px: empty, inside: Bits::default(), area_px: 0, level: mask.level })
-        .collect();
-    for ((box_px, area_px), members) in boxes.iter().zip(&masks_of_region).filter(|((_, area), _)| *area > 0)
-    {
-        for member in members {
-            let mask = &mut ideal[*member as usize];
-            mask.box_px = join(mask.box_px, *box_px);
-            mask.area_px += area_px;
+    let joined = |(mask, parts): (&Mask, Vec<&Mask>)| {
+        let box_px = parts.iter().map(|part| part.box_px).reduce(BoxPx::join)?;
+        let mut inside = Bits::of(false, box_px.area_px() as usize);
+        for part in &parts {
+            let BoxPx { x0, y0, x1, y1 } = part.box_px;
+            let pixels = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))).zip(part.inside.iter());
+            pixels.filter(|(_, is)| *is).for_each(|((x, y), _)| inside.set(box_px.place_of(x, y), true));
         }
-    }
-    for mask in ideal.iter_mut().filter(|mask| mask.area_px > 0) {
-        mask.inside = Bits::of(false, mask.box_px.width_px() as usize * mask.box_px.height_px() as usize);
-    }
-    for (region, x, y) in covered() {
-        for member in &masks_of_region[region] {
-            let mask = &mut ideal[*member as usize];
-            let row = (y - mask.box_px.y0) as usize * mask.box_px.width_px() as usize;
-            mask.inside.set(row + (x - mask.box_px.x0) as usize, true);
-        }
-    }
-    ideal.retain(|mask| mask.area_px > 0);
-    ideal
+        let area_px = parts.iter().map(|part| part.area_px).sum();
+        Some(Mask { box_px, inside, area_px, level: mask.level })
+    };
+    masks.iter().zip(parts_of_mask).filter_map(joined).collect()
 }
 
 pub(super) fn too_large(path: &Path) -> SegmentError {

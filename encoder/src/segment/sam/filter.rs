@@ -224,8 +224,7 @@ impl Filters<'_> {
             *self.settings;
         if n_crops > 1 {
             // Smaller crops show more detail.
-            let area = |b: BoxPx| f64::from(b.width_px()) * f64::from(b.height_px());
-            let scores = candidates.iter().map(|candidate| 1.0 / area(candidate.crop)).collect();
+            let scores = candidates.iter().map(|candidate| 1.0 / candidate.crop.area_px() as f64).collect();
             candidates = by_boxes(candidates, scores, crop_nms_iou);
         }
         if min_region_px > 0 {

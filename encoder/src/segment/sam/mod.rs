@@ -160,8 +160,7 @@ impl Segmenter for SamSegmenter {
         drop(sam);
         let unique = |list| filters.unique_in_image(list, crops.len());
         let kept: Vec<Candidate> = input.install(|| found.into_iter().flat_map(unique).collect());
-        let area = |b: BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
-        if kept.iter().map(|candidate| area(candidate.mask.box_px)).sum::<u64>() > MAX_MASK_BYTES {
+        if kept.iter().map(|candidate| candidate.mask.box_px.area_px()).sum::<u64>() > MAX_MASK_BYTES {
             return Err(too_many(input));
         }
         Ok(kept.iter().map(|candidate| candidate.mask.to_mask(candidate.level)).collect())
