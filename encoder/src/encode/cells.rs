@@ -37,20 +37,11 @@ use crate::shard::{self, BuiltShard, CellEmbeddings, ShardBuilder};
 use crate::store::Extras;
 
 pub(super) struct BuiltCells {
-    pub(super) records: Vec<CellRecord>,
-    /// By cell, of its residual code.
-    pub(super) n_subspaces: Vec<u32>,
-    pub(super) n_entries: Vec<u64>,
+    pub(super) cells: Vec<FinishedCell>,
+    pub(super) n_entries_of_cell: Vec<u64>,
     pub(super) extras: Extras,
-    pub(super) n_without_evidence: u64,
     pub(super) objects: Option<ObjectsReport>,
     pub(super) occupancy: Option<OccupancyReport>,
-    pub(super) counts: Counts,
-    /// Over Gaussians with evidence: sums of mean score and mean squared score, and their number.
-    score_sums: [f64; 3],
-}
-
-pub(super) struct Counts {
     pub(super) n_views_without_masks: usize,
     pub(super) n_masks: usize,
     pub(super) n_regions: usize,
@@ -59,17 +50,14 @@ pub(super) struct Counts {
 }
 
 impl BuiltCells {
-    fn add(&mut self, cell: FinishedCell) {
-        self.records.push(cell.record);
-        self.extras.extend(cell.fields);
-        self.n_subspaces.push(cell.n_subspaces);
-        self.n_without_evidence += cell.n_without_evidence;
-        self.score_sums.iter_mut().zip(cell.score_sums).for_each(|(all, of_cell)| *all += of_cell);
+    pub(super) fn n_without_evidence(&self) -> u64 {
+        self.cells.iter().map(|cell| cell.n_without_evidence).sum()
     }
 
     /// Mean and spread of the text bank's scores over all cells.
     pub(super) fn calibration(&self) -> Calibration {
-        let [sum, squares, n] = self.score_sums;
+        let total = |of: usize| self.cells.iter().map(|cell| cell.score_sums[of]).sum::<f64>();
+        let [sum, squares, n] = [0, 1, 2].map(total);
         let mean = sum / n.max(1.0);
         let variance = (squares / n.max(1.0) - mean * mean).max(0.0);
         Calibration { score_mean: mean as f32, score_spread: variance.sqrt() as f32 }
@@ -85,7 +73,7 @@ pub(super) fn build_cells(
 ) -> Result<BuiltCells, EncodeError> {
     let Plan { inputs, settings, .. } = *plan;
     let opened = plan.context.install(|| Opened::of(plan, views, occupancy.as_ref()))?;
-    let Opened { index, table, score_context, photos, pass_bytes, cells: budget } = opened;
+    let Opened { index, table, score_context, photos, pass_bytes, group_bytes, n_at_once } = opened;
     let scene = SceneContributions {
         index: &index,
         gaussians: &inputs.scene,
@@ -96,20 +84,14 @@ pub(super) fn build_cells(
         cancel: plan.context.cancel,
     };
     // Before refinement adds superpoints as regions.
-    let counts = Counts {
-        n_views_without_masks: index.views.iter().filter(|view| view.n_masks == 0).count(),
-        n_masks: table.n_masks(),
-        n_regions: table.len(),
-        n_entries: index.n_entries(),
-        views: views_report(views, &index),
-    };
+    let (n_masks, n_regions) = (table.n_masks(), table.len());
     let (table, refinement, mut objects) = refine(plan, &scene, table, &score_context)?;
     if let Some(found) = &mut objects
         && settings.cells.shards.have_appearance()
     {
         found.thumbnails = thumbnails(plan, &found.objects, views)?;
     }
-    let extras = put_extras(plan, &table)?;
+    let mut extras = put_extras(plan, &table)?;
     plan.context.begin_phase(Phase::Cells);
     plan.context.progress.begin("cells", "cell", inputs.split.cells.len() as u64, 0);
     let has_poses = settings.cells.photo_poses;
@@ -123,23 +105,23 @@ pub(super) fn build_cells(
         landmarks,
         photo_poses: has_poses.then(|| shard::photo_poses(&inputs.split, &views.used)),
     };
-    let finished = maker.build(&index, budget)?;
+    let mut cells = maker.build(&index, group_bytes, n_at_once)?;
     plan.context.progress.end();
-    let mut n_entries = vec![0; inputs.split.cells.len()];
-    index.parts.iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
-    let mut built = BuiltCells {
-        records: Vec::new(),
-        n_subspaces: Vec::new(),
-        n_entries,
+    extras.extend(cells.iter_mut().flat_map(|cell| std::mem::take(&mut cell.fields)));
+    let mut n_entries_of_cell = vec![0; inputs.split.cells.len()];
+    index.parts.iter().for_each(|part| n_entries_of_cell[part.cell_id as usize] += part.n_entries);
+    Ok(BuiltCells {
+        cells,
+        n_entries_of_cell,
         extras,
-        n_without_evidence: 0,
         objects: maker.objects.map(|objects| objects.report),
         occupancy: maker.occupancy.map(|occupancy| occupancy.report),
-        counts,
-        score_sums: [0.0; 3],
-    };
-    finished.into_iter().for_each(|cell| built.add(cell));
-    Ok(built)
+        n_views_without_masks: index.views.iter().filter(|view| view.n_masks == 0).count(),
+        n_masks,
+        n_regions,
+        n_entries: index.n_entries(),
+        views: views_report(views, &index),
+    })
 }
 
 /// Returns the regions, with superpoints that refinement added, and the objects.
@@ -240,7 +222,9 @@ struct Opened {
     photos: Vec<Photo>,
     /// Bytes of contributions that a pass of refinement or objects may hold.
     pass_bytes: u64,
-    cells: CellsBudget,
+    /// The same while cells are made, `n_at_once` of them.
+    group_bytes: u64,
+    n_at_once: usize,
 }
 
 impl Opened {
@@ -295,9 +279,8 @@ impl Opened {
             ScoreMetricContext { metric, bank, spread }
         });
         let n_at_once = 1 + n_more as usize;
-        let cells = CellsBudget { group_bytes, n_at_once };
-        tracing::debug!("{} cells at once, {cell_bytes} bytes each", cells.n_at_once);
-        Ok(Self { index, table, score_context, photos, pass_bytes, cells })
+        tracing::debug!("{n_at_once} cells at once, {cell_bytes} bytes each");
+        Ok(Self { index, table, score_context, photos, pass_bytes, group_bytes, n_at_once })
     }
 }
 
@@ -313,31 +296,19 @@ struct CellMaker<'a> {
     landmarks: Option<Vec<BuiltLandmarks>>,
 }
 
-#[derive(Clone, Copy)]
-struct CellsBudget {
-    group_bytes: u64,
-    n_at_once: usize,
-}
-
 /// A cell while its parts are lifted.
 struct CellInWork {
     embeddings: CellEmbeddings,
     fields: Vec<(String, Hash32)>,
 }
 
-impl CellInWork {
-    fn empty(dim: usize) -> Self {
-        let embeddings = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
-        Self { embeddings, fields: Vec::new() }
-    }
-}
-
 /// A cell whose shards are in the store.
 #[derive(Debug)]
-struct FinishedCell {
-    record: CellRecord,
+pub(super) struct FinishedCell {
+    pub(super) record: CellRecord,
     fields: Vec<(String, Hash32)>,
-    n_subspaces: u32,
+    /// Of its residual code.
+    pub(super) n_subspaces: u32,
     n_without_evidence: u64,
     /// Over Gaussians with evidence: sums of mean score and mean squared score, and their number.
     score_sums: [f64; 3],
@@ -348,12 +319,20 @@ impl CellMaker<'_> {
     fn build(
         &self,
         index: &ContributionIndex,
-        budget: CellsBudget,
+        group_bytes: u64,
+        n_at_once: usize,
     ) -> Result<Vec<FinishedCell>, EncodeError> {
         let context = self.plan.context;
         // A large cell's vectors are allocated once and reused, neither copied nor cleared.
-        let free = (0..budget.n_at_once).map(|_| CellInWork::empty(self.table.dim())).collect();
-        let lent = Lanes::new([(0, free)]);
+        let empty = |_| CellInWork {
+            embeddings: CellEmbeddings {
+                dim: self.table.dim(),
+                vectors: Vec::new(),
+                has_evidence: Vec::new(),
+            },
+            fields: Vec::new(),
+        };
+        let lent = Lanes::new([(0, (0..n_at_once).map(empty).collect())]);
         let take_emptied = || {
             let mut cell = lent.take();
             cell.embeddings.has_evidence.clear();
@@ -364,9 +343,9 @@ impl CellMaker<'_> {
         let has_failed = AtomicBool::new(false);
         let is_stopped = || context.is_cancelled() || has_failed.load(Ordering::Relaxed);
         let workers = &context.workers;
-        let n_alone = workers.n_alone(self.plan.inputs.split.cells.len(), budget.n_at_once);
+        let n_alone = workers.n_alone(self.plan.inputs.split.cells.len(), n_at_once);
         std::thread::scope(|scope| -> Result<(), EncodeError> {
-            let mut parts = context.install(|| index.transposed_parts(&self.table, budget.group_bytes));
+            let mut parts = context.install(|| index.transposed_parts(&self.table, group_bytes));
             let mut next_part = || context.time("merge", || context.install(|| parts.next()));
             let mut cell = take_emptied();
             while let Some(contributions) = next_part() {

@@ -223,9 +223,7 @@ fn find_views(
     views: Vec<View>,
 ) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
     let n_views = views.len();
-    let missing: HashSet<String> =
-        ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
-    let (gone, found): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| missing.contains(&v.name));
+    let (found, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| v.image_path.is_file());
     if let (true, Some(first)) = (settings.run.strict, gone.first()) {
         return Err(EncodeError::Failed(format!(
             "{} of {n_views} photos are missing, the first is {}; give their folder with --images",
@@ -233,16 +231,12 @@ fn find_views(
             first.image_path.display()
         )));
     }
-    let skipped: Vec<SkippedView> = gone
-        .into_iter()
-        .map(|v| SkippedView {
-            reason: format!(
-                "{}: no such photo; give the photos' folder with --images",
-                v.image_path.display()
-            ),
-            view: v.name,
-        })
-        .collect();
+    let skip = |View { name: view, image_path, .. }: View| {
+        let reason =
+            format!("{}: no such photo; give the photos' folder with --images", image_path.display());
+        SkippedView { view, reason }
+    };
+    let skipped: Vec<SkippedView> = gone.into_iter().map(skip).collect();
     if found.is_empty() {
         let reason = skipped.first().map_or("the poses file has none".into(), |s| s.reason.clone());
         return Err(EncodeError::no_views(n_views, &reason));
@@ -301,8 +295,7 @@ fn identity(scene: &Gaussians, planned: &ViewpointSettings, device: &str) -> Res
         bytemuck::cast_slice(&scene.sh_rest),
     ];
     let columns = columns.map(|column| Hash32::of(column).to_string());
-    let of = (PLAN_VERSION, env!("CARGO_PKG_VERSION"), device, planned, scene.sh_degree, columns);
-    Ok(Hash32::of(&serde_json::to_vec(&of).map_err(std::io::Error::from)?))
+    hash_of(&(PLAN_VERSION, env!("CARGO_PKG_VERSION"), device, planned, scene.sh_degree, columns))
 }
 
 /// Whether a poses file, which is written last, belongs to this plan.

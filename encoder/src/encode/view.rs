@@ -116,7 +116,8 @@ enum Next {
     Embed(Cropped),
     /// With a unit vector for each mask.
     Raster(Vec<f32>, Partition),
-    Write(Lifted),
+    /// With the width at which weights were rasterised.
+    Write(ViewContributions, Vec<MaskOutline>, u32),
 }
 
 struct Cropped {
@@ -141,12 +142,6 @@ struct Partition {
     regions: RegionMap,
     masks_of_region: Vec<Vec<u32>>,
     outlines: Vec<MaskOutline>,
-}
-
-struct Lifted {
-    contributions: ViewContributions,
-    outlines: Vec<MaskOutline>,
-    raster_width_px: u32,
 }
 
 impl<'v> Work<'v> {
@@ -286,9 +281,12 @@ impl<'a> ViewStages<'a> {
                 let Cropped { crops, windows, patches, partition } = cropped;
                 Next::Raster(self.embed(view, crops, windows, patches)?, partition)
             }
-            Next::Raster(vectors, partition) => Next::Write(self.lift(view, vectors, partition)?),
-            Next::Write(lifted) => {
-                self.write(view, &lifted, work.secs)?;
+            Next::Raster(vectors, partition) => self.lift(view, vectors, partition)?,
+            Next::Write(contributions, outlines, raster_width_px) => {
+                self.tools.sink.check_unchanged(view, self.tools.segmenter)?;
+                let record = ViewRecord { raster_width_px, secs: work.secs };
+                self.tools.sink.keep(view, &contributions, &outlines, record)?;
+                self.tools.context.progress.advance(1);
                 return Ok(None);
             }
         };
@@ -440,7 +438,7 @@ impl<'a> ViewStages<'a> {
         Ok(result)
     }
 
-    fn lift(&self, view: &View, vectors: Vec<f32>, partition: Partition) -> Result<Lifted, EncodeError> {
+    fn lift(&self, view: &View, vectors: Vec<f32>, partition: Partition) -> Result<Next, EncodeError> {
         let Partition { raster_view, regions, masks_of_region, outlines } = partition;
         let ViewTools { engines, scene, split, .. } = self.tools;
         let weights = scene
@@ -450,15 +448,7 @@ impl<'a> ViewStages<'a> {
         self.n_unrepresentable.fetch_max(n_unrepresentable, Ordering::Relaxed);
         let dim = engines.models.dim();
         let contributions = ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, split);
-        Ok(Lifted { contributions, outlines, raster_width_px: raster_view.intrinsics.width_px })
-    }
-
-    fn write(&self, view: &View, lifted: &Lifted, secs: f32) -> Result<(), EncodeError> {
-        let record = ViewRecord { raster_width_px: lifted.raster_width_px, secs };
-        self.tools.sink.check_unchanged(view, self.tools.segmenter)?;
-        self.tools.sink.keep(view, &lifted.contributions, &lifted.outlines, record)?;
-        self.tools.context.progress.advance(1);
-        Ok(())
+        Ok(Next::Write(contributions, outlines, raster_view.intrinsics.width_px))
     }
 }
 

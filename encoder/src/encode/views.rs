@@ -14,8 +14,9 @@ use super::error::EncodeError;
 use super::inputs::Inputs;
 use super::pipeline;
 use super::plan::Plan;
-use super::report::{LeftOut, SkippedView, StageReport};
+use super::report::{GpuReport, LeftOut, SkippedView, StageReport};
 use super::view::{ViewRecord, ViewSink, ViewStages, Work};
+use crate::lanes::GpuLoad;
 use crate::memory::Phase;
 use crate::occupancy::{self, OccupancyError, SceneOccupancy};
 use crate::{landmarks, shard};
@@ -27,14 +28,10 @@ pub(super) struct DoneViews<'a> {
     pub(super) records: BTreeMap<String, ViewRecord>,
     /// Left out for a missing photo or an error, by name.
     pub(super) skipped: Vec<SkippedView>,
-    /// Left out for an error in this run.
-    pub(super) n_failed: usize,
     pub(super) n_resumed: usize,
     pub(super) coverage: Option<CoverageReport>,
-    pub(super) stages: Vec<StageReport>,
+    pub(super) run: ViewsRun,
     pub(super) secs: f64,
-    /// Device of the image model, if it ran.
-    pub(super) images_on: Option<String>,
 }
 
 /// Takes the unfinished views through their stages.
@@ -50,11 +47,10 @@ pub(super) fn run_views<'a>(plan: &Plan<'a>, executor: &dyn Executor) -> Result<
     plan.context.progress.plan(&planned, &cells);
     let start = Instant::now();
     plan.context.progress.begin("views", "view", plan.order.len() as u64, n_resumed as u64);
-    let ViewsRun { stages, skipped: failed, images_on } = executor.run_views(plan, &done)?;
+    let run = executor.run_views(plan, &done)?;
     plan.context.progress.end();
     let secs = start.elapsed().as_secs_f64();
-    let n_failed = failed.len();
-    let mut skipped = [&plan.inputs.missing[..], &failed[..]].concat();
+    let mut skipped = [&plan.inputs.missing[..], &run.skipped[..]].concat();
     skipped.sort_by(|a, b| a.view.cmp(&b.view));
     // Ordered by name, not by completion.
     let records = plan.job.done_views()?;
@@ -66,7 +62,7 @@ pub(super) fn run_views<'a>(plan: &Plan<'a>, executor: &dyn Executor) -> Result<
     }
     let coverage = plan.coverage.as_ref().map(|coverage| coverage.report(used.iter().copied()));
     let used = used.into_iter().map(|view| &views[view]).collect();
-    Ok(DoneViews { used, records, skipped, n_failed, n_resumed, coverage, stages, secs, images_on })
+    Ok(DoneViews { used, records, skipped, n_resumed, coverage, run, secs })
 }
 
 /// Finds free and occupied places from the used views; `None` if the settings do not ask for them.
@@ -161,7 +157,8 @@ impl Executor for Here {
         })?;
         let wall_secs = start.elapsed().as_secs_f64();
         for report in &mut reports {
-            report.add_gpus(stages.loads(&report.stage), wall_secs);
+            let gpu = |load: GpuLoad| GpuReport { busy_share: load.busy_secs / wall_secs, load };
+            report.gpus = stages.loads(&report.stage).into_iter().map(gpu).collect();
         }
         if plan.context.is_cancelled() {
             let n_done = plan.job.done_views()?.len();
@@ -225,6 +222,7 @@ pub(crate) trait Executor {
 
 pub(crate) struct ViewsRun {
     pub(crate) stages: Vec<StageReport>,
+    /// Left out for an error in this run.
     pub(crate) skipped: Vec<SkippedView>,
     /// Device of the image model, if it ran.
     pub(crate) images_on: Option<String>,
