@@ -139,10 +139,8 @@ impl InputArgs {
         };
         let views = self.views.as_deref();
         let folder = views.map(folder_of).filter(|_| self.images.is_none());
-        [Some(self.scene.as_path()), views, folder, self.images.as_deref(), frame]
-            .into_iter()
-            .flatten()
-            .collect()
+        let paths = [Some(self.scene.as_path()), views, folder, self.images.as_deref(), frame];
+        paths.into_iter().flatten().collect()
     }
 }
 
@@ -232,11 +230,8 @@ pub fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
 /// Makes `--models` valid for a later run in another folder.
 pub(crate) fn lasting_name(models: &Path) -> PathBuf {
     // The name of a pulled model is no path.
-    if models.is_dir() {
-        std::path::absolute(models).unwrap_or_else(|_| models.into())
-    } else {
-        models.into()
-    }
+    let folder = models.is_dir().then(|| std::path::absolute(models).ok()).flatten();
+    folder.unwrap_or_else(|| models.into())
 }
 
 /// One thread per model, because views are encoded in parallel.

@@ -272,8 +272,8 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
 
 /// Where masks come from, if not from the embedded model.
 fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
-    let ignore_ids = || args.ignore_mask_ids.clone();
-    let (own, other) = (!["auto", "graph"].contains(&args.masks.as_str()), args.sam.segmenter.is_some());
+    let other = args.sam.segmenter.is_some();
+    let own = !["auto", "graph"].contains(&args.masks.as_str());
     if !own && !args.ignore_mask_ids.is_empty() {
         return Err(anyhow!(
             "--ignore-mask-ids is for masks of your own; give these with --masks, or leave it out"
@@ -287,24 +287,23 @@ fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
     match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
         ("auto", of_sam) => Ok(of_sam),
         ("graph", None) => Ok(Some(Masks::Graph)),
-        (dir, None) => Ok(Some(Masks::Given { dir: dir.into(), ignore_ids: ignore_ids() })),
+        (dir, None) => {
+            let ignore_ids = args.ignore_mask_ids.clone();
+            Ok(Some(Masks::Given { dir: dir.into(), ignore_ids }))
+        }
         (dir, Some(_)) => Err(anyhow!("--masks {dir} and --segmenter exclude each other; give one of them")),
-    }
-}
-
-/// Settings of the flags, with a target's choices, and what is expected of them.
-fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expectation>)> {
-    let settings = settings(args, &args.choices)?;
-    match args.target.choose(&settings.inputs)? {
-        Some((choices, expected)) => Ok((self::settings(args, &choices)?, Some(expected))),
-        None => Ok((settings, None)),
     }
 }
 
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     common::check(args.report.as_deref(), &args.paths_read(), Some(&args.store))?;
     args.report.iter().try_for_each(|path| files::check_writable(path))?;
-    let (mut settings, expected) = settings_and_target(args)?;
+    let mut settings = settings(args, &args.choices)?;
+    let target = args.target.choose(&settings.inputs)?;
+    if let Some((choices, _)) = &target {
+        settings = self::settings(args, choices)?;
+    }
+    let expected = target.map(|(_, expected)| expected);
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     settings.run.gpus = args.gpus.numbers(&session);

@@ -1,6 +1,6 @@
 //! `keys`: the keys of a store's roles.
 
-use std::fmt;
+use std::fmt::{self, Write};
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
@@ -155,7 +155,7 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
 }
 
 fn show(json: bool, status: &KeysStatus) -> Result<Exit> {
-    print(json, status, Lines(status))?;
+    print(json, status, lines(status)?)?;
     Ok(Exit::Done)
 }
 
@@ -175,21 +175,17 @@ fn changed(json: bool, changed: &Changed) -> Result<Exit> {
     Ok(Exit::Done)
 }
 
-struct Lines<'a>(&'a KeysStatus);
-
-impl fmt::Display for Lines<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let status = self.0;
-        let expires = format_utc(status.root_expires_unix_secs);
-        writeln!(f, "root       {} until {expires}", status.root_version)?;
-        writeln!(f, "SHA-256    {}", status.root_sha256)?;
-        writeln!(f, "threshold  {}", status.threshold)?;
-        let timestamp = status.timestamp_expires_unix_secs.map_or("not published yet".into(), format_utc);
-        writeln!(f, "timestamp  until {timestamp}")?;
-        for key in &status.keys {
-            let place = if key.is_here { "" } else { " (elsewhere)" };
-            writeln!(f, "{:<10} {}{place}", key.role, key.id)?;
-        }
-        Ok(())
+fn lines(status: &KeysStatus) -> Result<String, fmt::Error> {
+    let mut lines = String::new();
+    let expires = format_utc(status.root_expires_unix_secs);
+    writeln!(lines, "root       {} until {expires}", status.root_version)?;
+    writeln!(lines, "SHA-256    {}", status.root_sha256)?;
+    writeln!(lines, "threshold  {}", status.threshold)?;
+    let timestamp = status.timestamp_expires_unix_secs.map_or("not published yet".into(), format_utc);
+    writeln!(lines, "timestamp  until {timestamp}")?;
+    for key in &status.keys {
+        let place = if key.is_here { "" } else { " (elsewhere)" };
+        writeln!(lines, "{:<10} {}{place}", key.role, key.id)?;
     }
+    Ok(lines)
 }

@@ -1,6 +1,6 @@
 //! `store`: what a store holds, whether it is whole, and what can go.
 
-use std::fmt;
+use std::fmt::{self, Write};
 use std::path::PathBuf;
 
 use anyhow::Result;
@@ -89,7 +89,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             let verified = reader.verify(|| progress.advance(1));
             progress.end();
             warn_of_expiry(&at.store);
-            print(json, &verified, Lines(&verified))?;
+            print(json, &verified, lines(&verified)?)?;
             Ok(if verified.bad.is_empty() { Exit::Done } else { Exit::Failed })
         }
         StoreCommand::Gc(at) => {
@@ -187,31 +187,25 @@ impl fmt::Display for Listed {
     }
 }
 
-struct Lines<'a>(&'a Verified);
-
-impl fmt::Display for Lines<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Verified { n_files, len_bytes, bad } = self.0;
-        for object in bad {
-            let path = object.path.display();
-            match &object.fault {
-                Fault::Missing => write!(f, "{path}: missing")?,
-                Fault::Damaged => write!(f, "{path}: damaged")?,
-                Fault::Unreadable(error) => write!(f, "{path}: {error}")?,
-                Fault::Refused(what) => write!(f, "{path}: robots refuse it: {what}")?,
-            }
-            match object.holds.is_empty() {
-                true => writeln!(f)?,
-                false => writeln!(f, " ({})", object.holds.join("; "))?,
-            }
+fn lines(verified: &Verified) -> Result<String, fmt::Error> {
+    let mut lines = String::new();
+    let Verified { n_files, len_bytes, bad } = verified;
+    for object in bad {
+        let path = object.path.display();
+        match &object.fault {
+            Fault::Missing => write!(lines, "{path}: missing")?,
+            Fault::Damaged => write!(lines, "{path}: damaged")?,
+            Fault::Unreadable(error) => write!(lines, "{path}: {error}")?,
+            Fault::Refused(what) => write!(lines, "{path}: robots refuse it: {what}")?,
         }
-        write!(f, "{n_files} files, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
-        // Faults of metadata carry their own remedy.
-        let has_objects = bad.iter().any(|file| file.hash.is_some());
-        writeln!(
-            f,
-            "{}",
-            if has_objects { "; another encode into this store writes objects anew" } else { "" }
-        )
+        match object.holds.is_empty() {
+            true => writeln!(lines)?,
+            false => writeln!(lines, " ({})", object.holds.join("; "))?,
+        }
     }
+    write!(lines, "{n_files} files, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
+    // Faults of metadata carry their own remedy.
+    let has_objects = bad.iter().any(|file| file.hash.is_some());
+    lines += if has_objects { "; another encode into this store writes objects anew\n" } else { "\n" };
+    Ok(lines)
 }

@@ -72,9 +72,10 @@ pub(super) fn publish(
 fn tidy_up(plan: Plan<'_>, has_open: bool, encoder: Hash32) -> Result<(), EncodeError> {
     let models = plan.settings.output.models.clone();
     plan.store.remember_models(&ModelsRecord { encoder, models })?;
-    match plan.settings.run.keep_views || has_open {
-        true => plan.job.keep_published()?,
-        false => plan.job.clear()?,
+    if plan.settings.run.keep_views || has_open {
+        plan.job.keep_published()?
+    } else {
+        plan.job.clear()?
     }
     plan.store.prune()?;
     Ok(())

@@ -40,7 +40,7 @@ pub struct EncodeSettings {
     pub run: RunSettings,
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct InputSettings {
     pub scene: PathBuf,
     /// The poses: a COLMAP model, a transforms.json or a ScanNet scene folder.
@@ -241,19 +241,7 @@ impl EncodeSettings {
     /// of [`Preset::Balanced`](super::Preset::Balanced).
     pub fn new(scene: PathBuf, views: PathBuf, store: PathBuf, metric: bool) -> Self {
         Self {
-            inputs: InputSettings {
-                scene,
-                views,
-                planned: None,
-                images: None,
-                added: Vec::new(),
-                dropped: Vec::new(),
-                every: None,
-                splat_frame: FrameChoice::Auto,
-                activated: Activated::default(),
-                metric,
-                geo: None,
-            },
+            inputs: InputSettings { scene, views, metric, ..InputSettings::default() },
             view: ViewSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
                 min_mask_px: 200,

@@ -28,7 +28,7 @@ use crate::masks::patches::{Windows, patch_masks};
 use crate::masks::regions::{absorb_slivers, partition};
 use crate::masks::{self, Mask, RegionMap};
 use crate::memory::MemoryPlan;
-use crate::raster::{GpuSlots, LoadedScene, RasterView};
+use crate::raster::{LoadedScene, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
 
 const PICTURE_WIDTH_PX: u32 = 480;
@@ -153,7 +153,7 @@ impl<'v> Work<'v> {
 impl ViewTools<'_> {
     /// In the order of [`ViewStages::step`].
     pub(super) fn stages(&self) -> Vec<Stage> {
-        let raster_slots = self.scene.gpus().map(GpuSlots::n_views);
+        let raster_slots = self.scene.views_on_gpus();
         let on_cpu = |name| Stage { name, n_slots: self.n_threads, on_cpu: true };
         let on_device = |name, n_slots: Option<usize>| match n_slots {
             Some(n_slots) => Stage { name, n_slots, on_cpu: false },
@@ -243,7 +243,7 @@ impl<'a> ViewStages<'a> {
         self.odd_photos.warn();
         let n = self.n_unrepresentable.load(Ordering::Relaxed);
         if n > 0 {
-            let is_on_gpu = self.tools.scene.gpus().is_some();
+            let is_on_gpu = self.tools.scene.views_on_gpus().is_some();
             let advice =
                 if is_on_gpu { "; on a GPU without f64, --device cpu draws more of them" } else { "" };
             tracing::warn!(

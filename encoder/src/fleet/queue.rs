@@ -287,10 +287,7 @@ async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliv
                 (_, None) => return,
             }
         }
-        match is_sound {
-            true => consumer = Some(open),
-            false => tokio::time::sleep(RETRY_PAUSE).await,
-        }
+        if is_sound { consumer = Some(open) } else { tokio::time::sleep(RETRY_PAUSE).await }
     }
 }
 

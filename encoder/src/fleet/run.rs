@@ -111,10 +111,7 @@ impl Run {
     }
 
     pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
-        match self.has_ended(bucket)? {
-            true => Err(self.superseded(bucket)),
-            false => Ok(()),
-        }
+        if self.has_ended(bucket)? { Err(self.superseded(bucket)) } else { Ok(()) }
     }
 
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {

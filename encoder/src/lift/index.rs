@@ -73,6 +73,12 @@ impl PartContributions {
     pub(crate) fn entries_of(&self, k: usize) -> Range<usize> {
         self.starts[k] as usize..self.starts[k + 1] as usize
     }
+
+    /// Regions and weights of a Gaussian's entries.
+    pub(super) fn entries(&self, k: usize) -> impl Iterator<Item = (u32, f32)> {
+        let of = self.entries_of(k);
+        self.regions[of.clone()].iter().copied().zip(self.weights[of].iter().copied())
+    }
 }
 
 /// A view's file, and the position of its regions and runs in the scene.

@@ -29,10 +29,7 @@ pub(crate) struct SceneContributions<'a> {
 
 impl SceneContributions<'_> {
     pub(crate) fn check_cancelled(&self) -> Result<(), ContributionError> {
-        match self.cancel.load(Ordering::Relaxed) {
-            true => Err(ContributionError::Cancelled),
-            false => Ok(()),
-        }
+        if self.cancel.load(Ordering::Relaxed) { Err(ContributionError::Cancelled) } else { Ok(()) }
     }
 
     /// Calls `work` for each part on all threads, and `merge` with the results in the order of parts.

@@ -53,16 +53,13 @@ impl SceneOccupancy {
 /// Bytes per candidate: with what was seen there, and as a block both in the list of all and in its cell's.
 const BYTES_PER_CANDIDATE: u64 = (size_of::<Candidate>() + 2 * size_of::<Block>()) as u64;
 
+#[derive(Debug, thiserror::Error)]
 pub(crate) enum OccupancyError {
-    Memory(MemoryError),
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
     /// The view of this index cannot be drawn.
+    #[error("view {0}: {1}")]
     View(usize, RasterError),
-}
-
-impl From<MemoryError> for OccupancyError {
-    fn from(error: MemoryError) -> Self {
-        Self::Memory(error)
-    }
 }
 
 /// Finds free and occupied places from a scene's Gaussians and views, within `memory`; `None` if cancelled.

@@ -21,20 +21,6 @@ pub use cpu::CpuRasterizer;
 pub(crate) use cpu::reserve;
 pub use slag_raster::{Drawing, InputError, RasterView, constants, pinhole};
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct GpuSlots {
-    pub(crate) n_gpus: usize,
-    /// Concurrent views per GPU.
-    pub views_in_flight: usize,
-}
-
-impl GpuSlots {
-    /// Concurrent views on all GPUs.
-    pub fn n_views(self) -> usize {
-        self.n_gpus * self.views_in_flight
-    }
-}
-
 pub trait Rasterizer: Send + Sync {
     /// Differs between rasterisers whose contributions differ in their last bits.
     fn identity(&self) -> String;
@@ -75,8 +61,8 @@ pub trait LoadedScene: Send + Sync {
     /// Draws the scene over a background colour, in the colour space of its training.
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
 
-    /// `None` if views are rasterised on the caller's threads.
-    fn gpus(&self) -> Option<GpuSlots> {
+    /// Concurrent views on all GPUs; `None` if views are rasterised on the caller's threads.
+    fn views_on_gpus(&self) -> Option<usize> {
         None
     }
 }

@@ -88,7 +88,7 @@ impl Catalogue {
     pub(crate) fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
         if SystemTime::now() < UNIX_EPOCH {
             // sled panics then.
-            return Err(StoreError::Clock);
+            return Err(StoreError::Failed("this machine's clock says a time before 1970; set it".into()));
         }
         let path = store.join("db");
         let refused = |fault| match fault {

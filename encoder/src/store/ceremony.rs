@@ -139,7 +139,8 @@ impl Metadata {
             keys.keyids.dedup();
         }
         if let (0, Change::Key(id)) = (n_replaced, change) {
-            return Err(StoreError::NoSuchKey { id: id.clone() });
+            let help = "`slag-encoder keys status` lists the keys";
+            return Err(StoreError::Failed(format!("no role has the key {id}; {help}")));
         }
         let used: Vec<&String> = next.roles.values().flat_map(|keys| &keys.keyids).collect();
         next.keys.retain(|id, _| used.contains(&id));
@@ -182,7 +183,8 @@ impl MetadataReader {
     }
 
     fn no_root(&self) -> StoreError {
-        StoreError::NoRoot { store: self.store.clone() }
+        let store = self.store.display();
+        StoreError::Failed(format!("{store} has no root yet; run `slag-encoder keys init`, or encode"))
     }
 }
 

@@ -7,8 +7,7 @@
 //! | `v1/metadata/` | metadata of The Update Framework; robots follow `timestamp.json`, which is written last |
 
 use std::collections::BTreeMap;
-use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -93,12 +92,12 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
 /// Refuses a folder that has another store's export, or what no export has; hidden files may lie there. `root`: the
 /// store's first.
 fn check_export(folder: &Path, root: Option<&Result<Vec<u8>, TufError>>) -> Result<(), StoreError> {
-    let refuse = |path: PathBuf, what| Err(StoreError::ExportFolder { path, what });
+    let refuse = |path: &Path, what| {
+        let path = path.display();
+        Err(StoreError::Failed(format!("{path}: {what}; name another folder with --out, or move this away")))
+    };
     for part in ["", "objects", "targets", "metadata"] {
-        let entries = match fs_err::read_dir(folder.join(part)) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => continue,
-            entries => entries?,
-        };
+        let Some(entries) = files::if_there(fs_err::read_dir(folder.join(part)))? else { continue };
         for entry in entries {
             let entry = entry?;
             let found = entry.file_name().to_string_lossy().into_owned();
@@ -112,17 +111,14 @@ fn check_export(folder: &Path, root: Option<&Result<Vec<u8>, TufError>>) -> Resu
                 _ => false,
             };
             if !is_ours && !found.starts_with('.') {
-                return refuse(entry.path(), "no export of a store has this");
+                return refuse(&entry.path(), "no export of a store has this");
             }
         }
     }
     let path = folder.join("metadata").join(FIRST_ROOT);
-    let exported = match fs_err::read(&path) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-        exported => exported?,
-    };
+    let Some(exported) = files::if_there(fs_err::read(&path))? else { return Ok(()) };
     match root {
         Some(Ok(root)) if *root == exported => Ok(()),
-        _ => refuse(path, "robots follow another store here"),
+        _ => refuse(&path, "robots follow another store here"),
     }
 }

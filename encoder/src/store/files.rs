@@ -43,6 +43,14 @@ impl HashingWriter {
     }
 }
 
+/// `None` for what is not there.
+pub(super) fn if_there<T>(found: io::Result<T>) -> io::Result<Option<T>> {
+    match found {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+        found => found.map(Some),
+    }
+}
+
 /// Hash and length of a file, read piece by piece.
 pub(super) fn hash_of(path: &Path) -> io::Result<(Hash32, u64)> {
     Hash32::of_reader(File::open(path)?)
@@ -101,10 +109,7 @@ pub(super) fn read_limited(
     max_bytes: u64,
     too_long: impl FnOnce(u64) -> StoreError,
 ) -> Result<Option<Vec<u8>>, StoreError> {
-    let file = match File::open(path) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-        file => file?,
-    };
+    let Some(file) = if_there(File::open(path))? else { return Ok(None) };
     let mut bytes = Vec::new();
     match file.take(max_bytes + 1).read_to_end(&mut bytes)? as u64 {
         n if n > max_bytes => Err(too_long(n)),
@@ -129,10 +134,7 @@ impl ModelsRecord {
 
     /// An unreadable record counts as absent: the user can still name the models.
     pub(super) fn read(dir: &Path) -> io::Result<Option<Self>> {
-        match fs_err::read(Self::path(dir)) {
-            Ok(bytes) => Ok(serde_json::from_slice(&bytes).ok()),
-            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(e) => Err(e),
-        }
+        let bytes = if_there(fs_err::read(Self::path(dir)))?;
+        Ok(bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()))
     }
 }

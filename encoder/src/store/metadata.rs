@@ -345,7 +345,10 @@ impl Metadata {
         now_unix_secs: u64,
     ) -> Result<(), StoreError> {
         if self.newest_root()?.is_some() {
-            return Err(StoreError::HasRoot { store: self.store.clone() });
+            return Err(StoreError::Failed(format!(
+                "{} has a root already; to change its keys, run `slag-encoder keys rotate` or `revoke`",
+                self.store.display()
+            )));
         }
         if self.is_published()? {
             // Robots trust a root of this store, and a new one of its version would not follow it.
@@ -421,10 +424,7 @@ impl Metadata {
         // A crash after the root was installed may have left the key behind.
         roles::promote(&self.store, role, &root.body)?;
         let key = roles::read(&self.store, role)?;
-        match root.body.roles[role].keyids.contains(&Key::of(&key).id()) {
-            true => Ok(key),
-            false => Err(wrong()),
-        }
+        if root.body.roles[role].keyids.contains(&Key::of(&key).id()) { Ok(key) } else { Err(wrong()) }
     }
 
     pub(super) fn write(&self, name: &str, bytes: &[u8]) -> Result<(), StoreError> {
@@ -471,10 +471,7 @@ fn read_file(store: &Path, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>
 
 /// File names in a store's metadata folder; none without the folder.
 pub(super) fn names(store: &Path) -> io::Result<Vec<String>> {
-    let entries = match fs_err::read_dir(folder(store)) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        entries => entries?,
-    };
+    let Some(entries) = files::if_there(fs_err::read_dir(folder(store)))? else { return Ok(Vec::new()) };
     entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect()
 }
 

@@ -66,13 +66,9 @@ pub enum StoreError {
         records_help(cause, "if the database is damaged, remove this folder: published scenes stay, unfinished jobs start over")
     )]
     Records { path: PathBuf, cause: sled::Error },
-    #[error(
-        "{}: it is no store and has other files, the first is {found:?}; name a store, or a folder that is empty or new",
-        path.display()
-    )]
-    NotAStore { path: PathBuf, found: String },
-    #[error("this machine's clock says a time before 1970; set it")]
-    Clock,
+    /// A message that says what to do.
+    #[error("{0}")]
+    Failed(String),
     #[error("{} is missing: nothing has been published here yet; run `slag-encoder encode` first", path.display())]
     NotPublished { path: PathBuf },
     #[error("{} is missing, though a scene was published here; run `slag-encoder encode` again, which writes it anew", path.display())]
@@ -102,20 +98,10 @@ pub enum StoreError {
         found_bytes.map_or("nothing".into(), |n| format!("{n} bytes"))
     )]
     MissingObject { hash: Hash32, path: PathBuf, expected_bytes: u64, found_bytes: Option<u64> },
-    #[error("{}: it is missing; encode again, which writes it anew", path.display())]
-    ObjectLost { path: PathBuf },
     #[error("{}: content has hash {found}, not that of its name: the file is damaged; remove it and encode again", path.display())]
     ObjectHash { path: PathBuf, found: Hash32 },
     #[error("{}: {cause}; encode again: what is damaged is written anew", path.display())]
     Shard { path: PathBuf, cause: ContainerError },
-    #[error("{}: {what}; name another folder with --out, or move this away", path.display())]
-    ExportFolder { path: PathBuf, what: &'static str },
-    #[error("{} has a root already; to change its keys, run `slag-encoder keys rotate` or `revoke`", store.display())]
-    HasRoot { store: PathBuf },
-    #[error("{} has no root yet; run `slag-encoder keys init`, or encode", store.display())]
-    NoRoot { store: PathBuf },
-    #[error("no role has the key {id}; `slag-encoder keys status` lists the keys")]
-    NoSuchKey { id: String },
     #[error("{}: {cause}; have `slag-encoder keys sign` sign the draft where root's keys lie", path.display())]
     RootDraft { path: PathBuf, cause: TufError },
     #[error("generation {found} cannot follow {current}; take the number from `next_generation`")]

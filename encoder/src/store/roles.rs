@@ -72,8 +72,10 @@ pub(super) fn make_all(
 pub(super) fn check_before_root(store: &Path) -> Result<(), StoreError> {
     read_folder(&root_folder(store), Err).map_err(before_root)?;
     let is_damaged = |role: &&str| matches!(KeyFile::read(&key_path(store, role)), Ok(KeyFile::Damaged));
-    let damaged_key = ONLINE.into_iter().find(is_damaged).map(|role| damaged(key_path(store, role)));
-    damaged_key.map_or(Ok(()), |error| Err(before_root(error)))
+    match ONLINE.into_iter().find(is_damaged) {
+        Some(role) => Err(before_root(damaged(key_path(store, role)))),
+        None => Ok(()),
+    }
 }
 
 /// Keys that no root names yet may be made anew.
@@ -92,10 +94,7 @@ pub(super) fn read_folder(
     folder: &Path,
     on_damage: impl Fn(StoreError) -> Result<(), StoreError>,
 ) -> Result<Vec<SigningKey>, StoreError> {
-    let entries = match fs_err::read_dir(folder) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        entries => entries?,
-    };
+    let Some(entries) = files::if_there(fs_err::read_dir(folder))? else { return Ok(Vec::new()) };
     let mut paths = entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<PathBuf>>>()?;
     paths.retain(|path| path.extension().is_some_and(|extension| extension == "key"));
     paths.sort();
@@ -169,10 +168,7 @@ enum KeyFile {
 
 impl KeyFile {
     fn read(path: &Path) -> Result<Self, StoreError> {
-        let file = match fs_err::File::open(path) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Self::Missing),
-            file => file?,
-        };
+        let Some(file) = files::if_there(fs_err::File::open(path))? else { return Ok(Self::Missing) };
         let mut text = String::new();
         match file.take(256).read_to_string(&mut text) {
             Err(e) if e.kind() == io::ErrorKind::InvalidData => return Ok(Self::Damaged),

@@ -59,10 +59,8 @@ impl StoreReader {
         for published in std::iter::once(self.current()).chain(self.previous()) {
             let generation = published.manifest.generation;
             for (hash, len_bytes, what) in contents(&published.manifest, &published.extras) {
-                listing
-                    .entry((hash, len_bytes))
-                    .or_default()
-                    .push(format!("{what}, generation {generation}"));
+                let holds = format!("{what}, generation {generation}");
+                listing.entry((hash, len_bytes)).or_default().push(holds);
             }
         }
         listing
@@ -141,17 +139,16 @@ pub(super) fn read_all(store: &Path) -> Result<MetadataFiles, StoreError> {
 
 /// What a robot would refuse of a store now.
 pub(super) fn refused(store: &Path) -> Result<Vec<Refused>, StoreError> {
-    let mut n_tries = 0;
-    loop {
+    for n_tries in 1.. {
         let metadata = read_all(store)?;
         let manifest = files::read_manifest_bytes(&store.join(files::MANIFEST))?.unwrap_or_default();
         let found = refused_of(store, &metadata, &manifest, clock_unix_secs());
-        n_tries += 1;
         if found.is_empty() || n_tries == N_TRIES {
             return Ok(found);
         }
         std::thread::sleep(PAUSE);
     }
+    Ok(Vec::new())
 }
 
 pub(super) fn refused_of(
@@ -225,13 +222,11 @@ impl Walk<'_> {
     }
 
     fn get(&self, name: &str) -> Result<&[u8], TufError> {
-        self.metadata.get(name).map_or_else(
-            || Err(missing(name)),
-            |read| match read {
-                Ok(bytes) => Ok(&bytes[..]),
-                Err(cause) => Err(cause.clone()),
-            },
-        )
+        match self.metadata.get(name) {
+            None => Err(missing(name)),
+            Some(Ok(bytes)) => Ok(bytes),
+            Some(Err(cause)) => Err(cause.clone()),
+        }
     }
 
     /// `name`: of a metadata file, or the manifest's.

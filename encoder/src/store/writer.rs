@@ -296,16 +296,16 @@ const NAMES: &str = "objects metadata extras keys tmp db db.damaged job drawn mo
 
 /// Refuses a folder with files that are none of a store's. A store, published or only begun, may have others besides.
 pub(crate) fn check_folder(dir: &Path) -> Result<(), StoreError> {
-    let entries = match fs_err::read_dir(dir) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-        entries => entries?,
-    };
+    let Some(entries) = files::if_there(fs_err::read_dir(dir))? else { return Ok(()) };
     let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
     let names = names.collect::<io::Result<BTreeSet<String>>>()?;
     let is_store = names.contains("objects") && (names.contains("extras") || names.contains("db"));
     let mut others = names.iter().filter(|name| !NAMES.split(' ').any(|known| known == *name));
     match others.next() {
-        Some(found) if !is_store => Err(StoreError::NotAStore { path: dir.to_owned(), found: found.clone() }),
+        Some(found) if !is_store => Err(StoreError::Failed(format!(
+            "{}: it is no store and has other files, the first is {found:?}; name a store, or a folder that is empty or new",
+            dir.display()
+        ))),
         _ => Ok(()),
     }
 }

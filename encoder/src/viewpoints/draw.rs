@@ -8,7 +8,7 @@ use glam::{DAffine3, DMat3, DVec3};
 use image::{DynamicImage, ImageError, ImageFormat, Rgb, RgbImage};
 use rayon::prelude::*;
 use serde_json::{Value, json};
-use slag_common::photo::{self, PhotoError};
+use slag_common::photo;
 use slag_common::{Gaussians, Intrinsics, durable, npy};
 
 use super::looks::pinhole;
@@ -27,18 +27,15 @@ const REACH_PX: i64 = 3;
 
 #[derive(Debug, thiserror::Error)]
 pub enum DrawError {
-    #[error("view {view}: {source}")]
-    Raster { view: String, source: RasterError },
     #[error(transparent)]
     Scene(#[from] RasterError),
     #[error(transparent)]
     Io(#[from] io::Error),
     #[error("a drawing as PNG: {0}")]
     Image(#[from] ImageError),
-    #[error("{}: this was not drawn by slag-encoder, so it is not replaced; name another folder, or move it away", path.display())]
-    Foreign { path: PathBuf },
-    #[error("{}: {fault}", path.display())]
-    Drawn { path: PathBuf, fault: PhotoError },
+    /// Of a view or a file, which it names.
+    #[error("{0}")]
+    Failed(String),
 }
 
 /// A view to draw, with its file name below `images/`.
@@ -52,8 +49,7 @@ pub struct DrawnView {
 
 /// Views of a plan, named in its order.
 pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
-    let [width_px, height_px] = SIZE_PX;
-    let intrinsics = pinhole(width_px, height_px);
+    let intrinsics = pinhole(SIZE_PX);
     let view = |(number, viewpoint): (usize, &Viewpoint)| DrawnView {
         name: format!("drawn-{number:04}.png"),
         view: RasterView { camera_from_world: viewpoint.camera_from_world, intrinsics },
@@ -71,7 +67,10 @@ pub(crate) fn check_folder(folder: &Path) -> Result<(), DrawError> {
     let has_files = |path: &PathBuf| fs_err::read_dir(path).is_ok_and(|mut found| found.next().is_some());
     let images = ["images", "depth", "coverage"].map(|name| folder.join(name)).into_iter().find(has_files);
     match images.or_else(|| poses.exists().then_some(poses)) {
-        Some(path) => Err(DrawError::Foreign { path }),
+        Some(path) => Err(DrawError::Failed(format!(
+            "{}: this was not drawn by slag-encoder, so it is not replaced; name another folder, or move it away",
+            path.display()
+        ))),
         None => Ok(()),
     }
 }
@@ -148,7 +147,7 @@ fn begin(folder: &Path, drawn_from: &str) -> Result<(), DrawError> {
 fn read(path: &Path) -> Result<RgbImage, DrawError> {
     let input = BufReader::new(fs_err::File::open(path)?);
     let read = photo::open(input).and_then(|decoder| Ok(DynamicImage::from_decoder(decoder)?.into_rgb8()));
-    read.map_err(|fault| DrawError::Drawn { path: path.to_owned(), fault })
+    read.map_err(|fault| DrawError::Failed(format!("{}: {fault}", path.display())))
 }
 
 /// Writes each view's drawing as `finish` makes it, which gets the file to replace.
@@ -161,7 +160,7 @@ fn draw_images(
 ) -> Result<(), DrawError> {
     progress.begin("draw", "view", views.len() as u64, 0);
     let draw_one = |view: &DrawnView| {
-        let failed = |source| DrawError::Raster { view: view.name.clone(), source };
+        let failed = |source| DrawError::Failed(format!("view {}: {source}", view.name));
         let drawing = scene.draw(&view.view, BACKGROUND).map_err(failed)?;
         let path = folder.join("images").join(&view.name);
         path.parent().map_or(Ok(()), fs_err::create_dir_all)?;

@@ -48,8 +48,8 @@ pub(super) fn look_at(eye: DVec3, target: DVec3) -> DAffine3 {
     look_along(eye, target - eye)
 }
 
-pub(super) fn pinhole(width_px: u32, height_px: u32) -> Intrinsics {
-    raster::pinhole([width_px, height_px], 0.5 * f64::from(width_px) / HALF_WIDTH)
+pub(super) fn pinhole(size_px: [u32; 2]) -> Intrinsics {
+    raster::pinhole(size_px, 0.5 * f64::from(size_px[0]) / HALF_WIDTH)
 }
 
 /// Draws each Gaussian's weight at each pixel, and judges the view.
@@ -62,7 +62,7 @@ pub(super) fn look(
     let [width_px, height_px] = SIZE_PX;
     let n_px = width_px * height_px;
     let regions = RegionMap { width_px, height_px, region_of_pixel: (0..n_px).collect(), n_regions: n_px };
-    let intrinsics = pinhole(width_px, height_px);
+    let intrinsics = pinhole(SIZE_PX);
     let view = RasterView { camera_from_world: camera, intrinsics };
     let weights = loaded.weights(&view, &regions)?;
     let eye = camera.inverse().translation;

@@ -22,7 +22,7 @@ use space::Space;
 pub(crate) use draw::check_folder;
 pub(crate) use draw::{DrawError, DrawnView, views_of};
 pub use draw::{POSES_FILE, draw, draw_sharpened};
-pub(crate) use plan::{Fault, Viewpoint};
+pub(crate) use plan::Viewpoint;
 pub use plan::{SceneKind, Verdict, ViewpointError, ViewpointPlan, ViewpointSettings};
 
 /// Default number of views: twice as many gain 1 % of average precision.
@@ -55,6 +55,7 @@ pub fn plan(
     memory_bytes: u64,
     cancel: &AtomicBool,
 ) -> Result<ViewpointPlan, ViewpointError> {
+    let refused = ViewpointError::Refused;
     let stride = (scene.len() / ENOUGH_GAUSSIANS).clamp(1, MAX_STRIDE);
     // Columns of means, rotations, scales, opacities and colours, and the candidates' looks.
     let mut memory = MemoryPlan::new(memory_bytes);
@@ -67,7 +68,8 @@ pub fn plan(
     let thin = space::thinned(scene, stride, grown)?;
     let up = match settings.up {
         Some(up) => {
-            up::Up { axis: up.try_normalize().ok_or(ViewpointError::BadUp(up))?, sign: up::Sign::Known }
+            let wrong = || refused(format!("--up {up}: expected three finite numbers, not all 0"));
+            up::Up { axis: up.try_normalize().ok_or_else(wrong)?, sign: up::Sign::Known }
         }
         None => up::find(&thin),
     };
@@ -86,14 +88,18 @@ pub fn plan(
         kind = SceneKind::Object;
         looked = look_at_all(&space, rasterizer, kind, cancel)?;
     } else if up.sign == up::Sign::Assumed {
-        return Err(ViewpointError::NoUp);
+        let advice = "give it with --up X,Y,Z, for example --up 0,0,1 where z points up";
+        return Err(refused(format!("the Gaussians do not tell which way is up; {advice}")));
     }
     let n_candidates = looked.len();
     let (good, bad): (Vec<Look>, Vec<Look>) =
         looked.into_iter().partition(|look| look.verdict.fault(kind).is_none());
     if good.len() < MIN_GOOD.min(settings.n_views) {
         let (n_good, faults) = (good.len(), faults(&bad, kind));
-        return Err(ViewpointError::FewViews { kind, n_good, n_candidates, faults });
+        return Err(refused(format!(
+            "only {n_good} of {n_candidates} planned views of this {kind} scene can be trusted ({faults}); give photos with \
+             --views, remove floaters from the splat, or state its upward direction with --up X,Y,Z"
+        )));
     }
     let (chosen, seen) = greedy(&good, space.scene.len(), settings.n_views);
     let views = chosen.into_iter().map(|at| Viewpoint {
@@ -126,7 +132,7 @@ fn look_at_all(
     looked.collect::<Vec<_>>().into_iter().collect()
 }
 
-fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
+fn n_with(looked: &[Look], kind: SceneKind, fault: Option<&str>) -> usize {
     looked.iter().filter(|look| look.verdict.fault(kind) == fault).count()
 }
 
@@ -134,12 +140,12 @@ fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
 /// other way to look at it.
 fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
     let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
-    2 * n_with(looked, kind, Some(Fault::Holes)) > looked.len()
+    2 * n_with(looked, kind, Some(plan::HOLES)) > looked.len()
         && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
 }
 
 fn faults(bad: &[Look], kind: SceneKind) -> String {
-    let all = Fault::ALL.map(|fault| (fault, n_with(bad, kind, Some(fault))));
+    let all = plan::FAULTS.map(|fault| (fault, n_with(bad, kind, Some(fault))));
     let told = all.iter().filter(|(_, n)| *n > 0).map(|(fault, n)| format!("{n} {fault}"));
     told.collect::<Vec<_>>().join(", ")
 }

@@ -44,7 +44,10 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize, grown: f32) -> Result<Ga
     }
     let n_solid = up::solid(&thin).count();
     if n_solid < MIN_GAUSSIANS {
-        return Err(ViewpointError::Empty { n: n_solid, expected: MIN_GAUSSIANS });
+        return Err(ViewpointError::Refused(format!(
+            "no views can be planned: {n_solid} Gaussians are opaque and finite, expected at least {MIN_GAUSSIANS}; give photos \
+             with --views"
+        )));
     }
     Ok(thin)
 }

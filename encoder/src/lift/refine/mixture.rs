@@ -22,7 +22,7 @@ const FILLED_WEIGHT_PX: f32 = 1e-3;
 /// Direction of each of a part's Gaussians, in 8 bits; zeros without evidence.
 pub(super) fn sketches(contributions: &PartContributions, region_points: &[Point]) -> Vec<[i8; AXES]> {
     let sketch_of = |k: usize| -> [i8; AXES] {
-        let mut sum = sum_of(contributions, contributions.entries_of(k), region_points);
+        let mut sum = sum_of(contributions, k, region_points);
         make_unit(&mut sum);
         sum.map(|c| (127.0 * c).round() as i8)
     };
@@ -47,13 +47,8 @@ pub(super) fn part_sums(
         .collect();
     members.par_sort_unstable();
     let of_superpoint = |members: &[(u32, u32)]| -> (usize, Sums) {
-        let mut entries = Vec::new();
-        for (_, k) in members {
-            let of_gaussian = contributions.entries_of(*k as usize);
-            let regions = contributions.regions[of_gaussian.clone()].iter().copied();
-            entries.extend(regions.zip(contributions.weights[of_gaussian].iter().copied()));
-        }
-        (members[0].0 as usize, summed_by_key(entries))
+        let entries = members.iter().flat_map(|(_, k)| contributions.entries(*k as usize));
+        (members[0].0 as usize, summed_by_key(entries.collect()))
     };
     let runs: Vec<&[(u32, u32)]> = members.chunk_by(|a, b| a.0 == b.0).collect();
     runs.into_par_iter().map(of_superpoint).collect()
@@ -145,7 +140,7 @@ impl Mixtures {
         let entry_of = |k: usize| -> Option<AddedEntry> {
             let superpoint = self.of_gaussian[gaussians[k] as usize];
             let MixtureRegion { region, length: of_mixture } = (*self.regions.get(superpoint as usize)?)?;
-            let own = length(&sum_of(contributions, contributions.entries_of(k), region_points));
+            let own = length(&sum_of(contributions, k, region_points));
             if contributions.total_weights[k] > 0.0 && own > MIN_MEAN_LENGTH * contributions.total_weights[k]
             {
                 let weight = share * own / of_mixture;
@@ -214,15 +209,10 @@ pub(super) fn points_of_regions(
     regions.into_par_iter().map(point).collect()
 }
 
-pub(super) fn sum_of(
-    contributions: &PartContributions,
-    entries: Range<usize>,
-    region_points: &[Point],
-) -> Point {
+pub(super) fn sum_of(contributions: &PartContributions, k: usize, region_points: &[Point]) -> Point {
     let mut sum = [0.0; AXES];
-    for (region, weight) in contributions.regions[entries.clone()].iter().zip(&contributions.weights[entries])
-    {
-        add(&mut sum, *weight, &region_points[*region as usize]);
+    for (region, weight) in contributions.entries(k) {
+        add(&mut sum, weight, &region_points[region as usize]);
     }
     sum
 }

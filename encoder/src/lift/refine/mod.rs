@@ -109,11 +109,12 @@ impl PendingRefinement {
             mixtures: Vec::new(),
         };
         let mut pending = Self { refinement, table, mask_points: Vec::new(), scales: Vec::new() };
-        if settings.needs_mixtures() && !pending.table.is_empty() {
+        // Where Gaussians share evidence, vectors are needed in principal coordinates.
+        if settings.n_partitions() > 0 && !pending.table.is_empty() {
             let Self { refinement, table, mask_points, scales } = &mut pending;
             *mask_points = principal_coordinates(table.mask_vectors(), AXES).as_chunks().0.to_vec();
             refinement.region_points = mixture::points_of_regions(table, mask_points, 0..table.len());
-            if settings.needs_superpoints() {
+            if settings.n_scales() > 0 {
                 *scales = refinement.superpoints(scene, table)?;
             }
         }
@@ -212,7 +213,7 @@ impl Refinement {
     /// Reserves lists over all Gaussians: the superpoints' graph, and each Gaussian's superpoints until the last cell.
     pub(crate) fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
         let n_scales = settings.n_scales();
-        if settings.needs_superpoints() {
+        if n_scales > 0 {
             let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
             let graph_bytes = Superpoints::working_bytes(n_gaussians, n_scales);
             memory.reserve(Phase::Superpoints, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
@@ -247,8 +248,34 @@ impl Refinement {
         }
     }
 
+    /// Drops entries of views where a Gaussian has less than the least share of its weight in its best view.
     fn prune(&self, contributions: &mut PartContributions) {
-        prune(contributions, self.settings.min_view_share, &self.first_regions, &self.mask_counts);
+        let least = self.settings.min_view_share;
+        if least <= 0.0 {
+            return;
+        }
+        let kept_of = |k: usize| -> Vec<Range<usize>> {
+            let views = by_view(contributions, contributions.entries_of(k), &self.first_regions);
+            let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
+            let seen = views.into_iter().filter(|view| view.weight >= least * best);
+            seen.map(|view| view.entries).collect()
+        };
+        let n = contributions.total_weights.len();
+        let kept: Vec<Vec<Range<usize>>> = (0..n).into_par_iter().with_min_len(CHUNK).map(kept_of).collect();
+        let mut at = 0;
+        for (k, kept) in kept.into_iter().enumerate() {
+            let mut total = 0.0;
+            for entry in kept.into_iter().flatten() {
+                let (region, weight) = (contributions.regions[entry], contributions.weights[entry]);
+                (contributions.regions[at], contributions.weights[at]) = (region, weight);
+                total += f64::from(weight) * f64::from(self.mask_counts[region as usize]);
+                at += 1;
+            }
+            contributions.starts[k + 1] = at as u64;
+            contributions.total_weights[k] = total as f32;
+        }
+        contributions.regions.truncate(at);
+        contributions.weights.truncate(at);
     }
 }
 
@@ -285,15 +312,6 @@ impl Aggregation {
 
     pub(crate) fn has_fine_superpoints(&self) -> bool {
         self.superpoint > 0.0 || self.fill
-    }
-
-    pub(super) fn needs_superpoints(&self) -> bool {
-        self.has_fine_superpoints() || self.coarse > 0.0
-    }
-
-    /// Gaussians share evidence, so vectors are needed in principal coordinates.
-    pub(super) fn needs_mixtures(&self) -> bool {
-        self.needs_superpoints() || self.object > 0.0
     }
 
     /// Partitions within which Gaussians share evidence.
@@ -335,41 +353,6 @@ fn by_view(
         }
     }
     views
-}
-
-/// Drops entries of views where a Gaussian has less than `min_view_share` of its weight in its best view.
-/// `mask_counts`: `[n_regions]`, summed weight of the region's masks.
-pub(super) fn prune(
-    contributions: &mut PartContributions,
-    min_view_share: f32,
-    first_regions: &[u32],
-    mask_counts: &[f32],
-) {
-    if min_view_share <= 0.0 {
-        return;
-    }
-    let kept_of = |k: usize| -> Vec<Range<usize>> {
-        let views = by_view(contributions, contributions.entries_of(k), first_regions);
-        let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
-        let seen = views.into_iter().filter(|view| view.weight >= min_view_share * best);
-        seen.map(|view| view.entries).collect()
-    };
-    let n = contributions.total_weights.len();
-    let kept: Vec<Vec<Range<usize>>> = (0..n).into_par_iter().with_min_len(CHUNK).map(kept_of).collect();
-    let mut at = 0;
-    for (k, kept) in kept.into_iter().enumerate() {
-        let mut total = 0.0;
-        for entry in kept.into_iter().flatten() {
-            let (region, weight) = (contributions.regions[entry], contributions.weights[entry]);
-            (contributions.regions[at], contributions.weights[at]) = (region, weight);
-            total += f64::from(weight) * f64::from(mask_counts[region as usize]);
-            at += 1;
-        }
-        contributions.starts[k + 1] = at as u64;
-        contributions.total_weights[k] = total as f32;
-    }
-    contributions.regions.truncate(at);
-    contributions.weights.truncate(at);
 }
 
 #[cfg(test)]

@@ -146,10 +146,4 @@ impl Device {
         self.check()?;
         polled.map_err(|e| self.error(e.to_string())).map(drop)
     }
-
-    /// Fails like a lost device, for tests.
-    #[doc(hidden)]
-    pub fn lose(&self) {
-        self.device.destroy();
-    }
 }

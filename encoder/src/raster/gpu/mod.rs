@@ -53,7 +53,7 @@ impl GpuRasterizer {
     /// Fails like a lost device, for tests.
     #[doc(hidden)]
     pub fn lose(&self) {
-        self.device.lose();
+        self.device.device.destroy();
     }
 }
 
@@ -424,14 +424,20 @@ impl LoadedScene for GpuScene<'_> {
 mod tests {
     use super::*;
 
+    /// The first GPU; `None` without one.
+    pub(super) fn first_gpu() -> Option<Device> {
+        let adapter = adapters().into_iter().next();
+        if adapter.is_none() {
+            println!("skipped: no GPU");
+        }
+        adapter.map(|adapter| adapter.open(adapter.report.precision).expect("opens"))
+    }
+
     /// A panic in one view gives its place to the next, which would wait for ever otherwise.
     #[test]
     fn a_panic_gives_its_place_back() {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
-            return;
-        };
-        let device = Arc::new(adapter.open(Precision::F32).expect("opens"));
+        let Some(device) = first_gpu() else { return };
+        let device = Arc::new(device);
         let options = GpuOptions { views_in_flight: 1, ..GpuOptions::default() };
         let gaussians = Gaussians::default();
         let scene = GpuScene::new(device, options, &gaussians).expect("loads");
@@ -449,11 +455,8 @@ mod tests {
     /// Three views and memory for one: the places of two are given up, and none is made anew.
     #[test]
     fn fewer_views_are_in_flight_where_memory_does_not_suffice() {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
-            return;
-        };
-        let device = Arc::new(adapter.open(adapter.report.precision).expect("opens"));
+        let Some(device) = first_gpu() else { return };
+        let device = Arc::new(device);
         let options = GpuOptions { views_in_flight: 3, ..GpuOptions::default() };
         let gaussians = Gaussians::default();
         let scene = GpuScene::new(device, options, &gaussians).expect("loads");

@@ -69,15 +69,13 @@ impl Stages {
         let Buffers { view, counters, dispatches, block_counts, screen, tile_counts, .. } = &self.buffers;
         let n_blocks = [chunk.n_gaussians.div_ceil(WORKGROUP_SIZE), 1];
         let job = || part(&chunk.jobs, 0);
+        let mut run = |kernel: &wgpu::ComputePipeline, bound: &Bound<'_>, n| {
+            dispatch(pass, kernel, &bind(device, kernel, bound), n);
+        };
         let bound = [whole(view), whole(counters), job(), whole(gaussians), whole(block_counts)];
-        dispatch(
-            pass,
-            &kernels.count_visible,
-            &bind(device, &kernels.count_visible, &number(&bound)),
-            n_blocks,
-        );
+        run(&kernels.count_visible, &number(&bound), n_blocks);
         let bound = [part(&chunk.jobs, 1), whole(counters), whole(block_counts), whole(dispatches)];
-        dispatch(pass, &kernels.scan, &bind(device, &kernels.scan, &number(&bound)), [1, 1]);
+        run(&kernels.scan, &number(&bound), [1, 1]);
         let bound = [
             (0, whole(view)),
             (2, job()),
@@ -86,8 +84,7 @@ impl Stages {
             (5, whole(screen)),
             (6, whole(tile_counts)),
         ];
-        let kernel = &kernels.write_visible;
-        dispatch(pass, kernel, &bind(device, kernel, &bound), n_blocks);
+        run(&kernels.write_visible, &bound, n_blocks);
     }
 
     pub fn scan(&self, device: &Device, pass: &mut Pass<'_>, scan: Scan) {

@@ -141,10 +141,8 @@ impl Workspace {
         staging.map_async(wgpu::MapMode::Read, .., |_| {});
         device.wait(submission)?;
         let bytes = staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
-        let (head, rest) = bytes.split_at(COUNTERS_BYTES as usize);
-        let mut counts: Counts = Zeroable::zeroed();
-        counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
-        Ok((counts, bytemuck::cast_slice(rest).to_vec()))
+        let (counts, pixels) = counts_and_rest(&bytes);
+        Ok((counts, bytemuck::cast_slice(pixels).to_vec()))
     }
 
     fn upload(
@@ -227,9 +225,7 @@ impl Workspace {
         self.staging.map_async(wgpu::MapMode::Read, .., |_| {});
         device.wait(submission)?;
         let bytes = self.staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
-        let mut counts: Counts = Zeroable::zeroed();
-        let (head, rest) = bytes.split_at(COUNTERS_BYTES as usize);
-        counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
+        let (counts, rest) = counts_and_rest(&bytes);
         let n_contributions = counts[Counter::RegionSums as usize];
         if self.fits(&counts) && n_contributions <= self.n_copied {
             take(&bytemuck::cast_slice(rest)[..n_contributions as usize]);
@@ -238,6 +234,14 @@ impl Workspace {
         self.staging.unmap();
         Ok(counts)
     }
+}
+
+/// What a staging buffer has: the counters, then what was copied behind them.
+fn counts_and_rest(staged: &[u8]) -> (Counts, &[u8]) {
+    let (head, rest) = staged.split_at(COUNTERS_BYTES as usize);
+    let mut counts: Counts = Zeroable::zeroed();
+    counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
+    (counts, rest)
 }
 
 pub(crate) struct Band<'a> {
@@ -263,16 +267,11 @@ pub(crate) fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::raster::gpu::device::adapters;
     use crate::raster::gpu::jobs::Scan;
+    use crate::raster::gpu::tests::first_gpu;
 
-    /// First GPU; `None` without one.
     fn opened(capacities: Capacities) -> Option<(Device, Workspace)> {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
-            return None;
-        };
-        let device = adapter.open(adapter.report.precision).expect("opens");
+        let device = first_gpu()?;
         let size = Size { capacities, n_tiles: 1, n_px: 1, n_chunk: 1 };
         let workspace = Workspace::new(&device, size).expect("there is memory");
         Some((device, workspace))
