@@ -6,7 +6,7 @@ use std::path::Path;
 use half::f16;
 use serde_json::Value;
 use slag_common::shard::Profile;
-use slag_encoder::lift::published::{read_field, read_regions};
+use slag_encoder::lift::field::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
-use slag_encoder::lift::published::{read_field, read_regions};
+use slag_encoder::lift::field::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 

@@ -24,18 +24,11 @@ const RETRY_PAUSE: Duration = Duration::from_millis(300);
 
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum BlobError {
-    #[error(
-        "{url}: {problem}; expected file:///FOLDER, s3://BUCKET/PREFIX, or gs:// and az:// where the program was built with them"
-    )]
-    Address { url: String, problem: String },
-    #[error(
-        "{url}/{key}: {source}; check the address, the credentials (for S3 AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT) and the free space"
-    )]
-    Request { url: String, key: String, source: object_store::Error },
+    /// A message that says what to do.
+    #[error("{0}")]
+    Failed(String),
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    #[error("{url}/{key} is missing; was the prefix emptied while it was in use?")]
-    Missing { url: String, key: String },
 }
 
 #[derive(Clone, Debug)]
@@ -52,12 +45,17 @@ impl Bucket {
     /// Opens a bucket by URL or path of a folder. `variables`: the environment, with the credentials of object stores.
     ///
     /// # Errors
-    /// [`BlobError::Address`]; the bucket itself is first asked by a request.
+    /// [`BlobError`] for a wrong address; the bucket itself is first asked by a request.
     pub(crate) fn open(
         address: &str,
         variables: impl IntoIterator<Item = (String, String)>,
     ) -> Result<Self, BlobError> {
-        let refuse = |problem: String| BlobError::Address { url: address.to_owned(), problem };
+        let refuse = |problem: String| {
+            BlobError::Failed(format!(
+                "{address}: {problem}; expected file:///FOLDER, s3://BUCKET/PREFIX, or gs:// and az:// where the program was \
+                 built with them"
+            ))
+        };
         // Other users of TLS install it, too; only the first counts.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let runtime = Builder::new_multi_thread().worker_threads(N_THREADS).enable_all().build()?;
@@ -96,34 +94,33 @@ impl Bucket {
     }
 
     fn failed(&self, key: &str, source: object_store::Error) -> BlobError {
-        match source {
-            object_store::Error::NotFound { .. } => {
-                BlobError::Missing { url: self.url.clone(), key: key.to_owned() }
-            }
-            source => BlobError::Request { url: self.url.clone(), key: key.to_owned(), source },
-        }
+        BlobError::Failed(format!(
+            "{}/{key}: {source}; check the address, the credentials (for S3 AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, \
+             AWS_REGION, AWS_ENDPOINT) and the free space",
+            self.url
+        ))
     }
 
     pub(crate) fn get(&self, key: &str) -> Result<Option<Bytes>, BlobError> {
         let at = self.key(key);
-        match self.ask(|| async { self.store.get(&at).await?.bytes().await }) {
-            Ok(bytes) => Ok(Some(bytes)),
-            Err(object_store::Error::NotFound { .. }) => Ok(None),
-            Err(source) => Err(self.failed(key, source)),
-        }
+        self.if_there(key, self.ask(|| async { self.store.get(&at).await?.bytes().await }))
     }
 
     pub(crate) fn require(&self, key: &str) -> Result<Bytes, BlobError> {
-        let missing = || BlobError::Missing { url: self.url.clone(), key: key.to_owned() };
-        self.get(key)?.ok_or_else(missing)
+        let missing =
+            || format!("{}/{key} is missing; was the prefix emptied while it was in use?", self.url);
+        self.get(key)?.ok_or_else(|| BlobError::Failed(missing()))
     }
 
     pub(crate) fn len_of(&self, key: &str) -> Result<Option<u64>, BlobError> {
         let at = self.key(key);
-        match self.ask(|| self.store.head(&at)) {
-            Ok(found) => Ok(Some(found.size)),
+        Ok(self.if_there(key, self.ask(|| self.store.head(&at)))?.map(|found| found.size))
+    }
+
+    fn if_there<T>(&self, key: &str, answer: object_store::Result<T>) -> Result<Option<T>, BlobError> {
+        match answer {
             Err(object_store::Error::NotFound { .. }) => Ok(None),
-            Err(source) => Err(self.failed(key, source)),
+            answer => answer.map(Some).map_err(|source| self.failed(key, source)),
         }
     }
 

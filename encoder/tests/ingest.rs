@@ -276,6 +276,7 @@ fn geo_reference() {
         fs_err::write(&path, json).unwrap();
         read_geo_reference(&path)
     };
+    let refused = |json: &str| read(json).unwrap_err().to_string();
     let origin =
         read(r#"{"origin": {"lat": -90, "lon": 180, "alt": -3.5, "x": 1}, "more": []}"#).unwrap().origin;
     assert_eq!((origin.latitude_deg, origin.longitude_deg, origin.height_m), (-90.0, 180.0, -3.5));
@@ -284,7 +285,7 @@ fn geo_reference() {
         (r#"{"origin": {"lat": 0, "lon": -180.01, "alt": 0}}"#, "lon"),
         (r#"{"origin": {"lat": 0, "lon": 0, "alt": 1e6}}"#, "alt"),
     ] {
-        assert!(matches!(read(json), Err(GeoError::Range { field, .. }) if field == name), "{json}");
+        assert!(refused(json).contains(&format!("origin.{name} = ")), "{json}");
     }
     for json in [
         "",
@@ -295,16 +296,17 @@ fn geo_reference() {
         r#"{"origin": [8.54, 47.37, 400]}"#,
         r#"[{"lat": 1, "lon": 2, "alt": 3}]"#,
     ] {
-        assert!(matches!(read(json), Err(GeoError::Json { .. })), "{json}");
+        assert!(refused(json).contains("expected {\"origin\""), "{json}");
     }
     let utf16: Vec<u8> = "{}".encode_utf16().flat_map(u16::to_le_bytes).collect();
     fs_err::write(&path, utf16).unwrap();
-    assert!(matches!(read_geo_reference(&path), Err(GeoError::Text { .. })));
+    let text = read_geo_reference(&path).unwrap_err().to_string();
+    assert!(text.contains("UTF-8"), "{text}");
     assert!(read("\u{feff}{\"origin\": {\"lat\": 1, \"lon\": 2, \"alt\": 3}}").is_ok(), "a byte order mark");
     let twice = read(r#"{"origin": {"lat": 8, "lat": 47, "lon": 8, "alt": 0}}"#).unwrap_err().to_string();
     assert!(twice.contains("duplicate field `lat`"), "{twice}");
     // Endless, but no more than a limit is read.
-    assert!(matches!(read_geo_reference("/dev/zero".as_ref()), Err(GeoError::Json { .. })));
+    assert!(matches!(read_geo_reference("/dev/zero".as_ref()), Err(GeoError::File { .. })));
     let brighton = shared("scenes/brighton/geo.json");
     let origin = read_geo_reference(&brighton).unwrap().origin;
     assert_eq!(

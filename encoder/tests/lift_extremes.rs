@@ -4,12 +4,12 @@
 use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
-use slag_common::shard::{Profile, ShardLayout, ShardView};
+use slag_common::shard::{Additions, Profile, ShardLayout, ShardView};
 use slag_common::{Gaussians, Hash32};
 use slag_encoder::cells::{self, Cell, CellLimits, PositionError};
 use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable, ViewContributions};
-use slag_encoder::shard::{CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
+use slag_encoder::shard::{CellEmbeddings, ShardBuilder, ShardSettings};
 use slag_math::matrix::Rows;
 use slag_math::random::Random;
 
@@ -51,7 +51,7 @@ fn one_cell(
     let path = dir.path().join("view.contributions");
     view.write(&path).expect("writes");
     let (index, table) = ContributionIndex::open(&[path], DIM, &[input_indices.len()]).expect("opens");
-    assert_eq!(index.parts().len(), 1);
+    assert_eq!(index.parts.len(), 1);
     let raw = index.read(0..1).expect("reads");
     let contributions = index.transpose(&raw, &table).expect("transposes").remove(0);
     let mut embeddings = vec![f32::NAN; input_indices.len() * DIM];
@@ -227,7 +227,7 @@ fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (
         score_context: &score_context,
         settings: &settings,
     };
-    let built = builder.build(0, cell, embeddings, CellExtras::default());
+    let built = builder.build(0, cell, embeddings, None, Additions::default());
     (AlignedBytes::copy_of(&built.shards[0].bytes), built.position_error)
 }
 

@@ -352,7 +352,7 @@ pub fn contributions(data: &[u8]) -> bool {
         }
         // As an encode reads it.
         let transposed = ContributionIndex::open(&[path.to_owned()], 2, &[4]).and_then(|(index, table)| {
-            let entries = index.read(0..index.parts().len())?;
+            let entries = index.read(0..index.parts.len())?;
             index.transpose(&entries, &table)
         });
         is_read(opened, path) & is_read(transposed, path)

@@ -1,16 +1,16 @@
 //! Finds the mistake that explains why drawings and photos differ.
 
 use std::cell::Cell;
+use std::fmt;
+use std::path::PathBuf;
 
 use glam::{DQuat, DVec3};
 use serde::Serialize;
 use slag_common::{Gaussians, Similarity};
 
-use super::error::CheckError;
 use super::mistake::{FrameCandidate, FrameCause, Mistake};
-use super::options::CheckOptions;
-use super::suspicion::{at_per_mille, camera_spread, scene_diagonal};
-use super::view::{CheckView, at_width, mean};
+use super::suspicion::{Suspicion, at_per_mille, camera_spread, scene_diagonal};
+use super::view::{CheckError, CheckView, at_width, mean};
 use crate::raster::{LoadedScene, Rasterizer};
 
 /// PSNR from which no mistake goes unnoticed, dB.
@@ -243,35 +243,38 @@ impl Search<'_> {
         trial.psnr_db > (self.given_psnr_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
     }
 
-    /// Refines a similarity that is swept or computed from other data than the trainer's (pattern search, Hooke and
-    /// Jeeves 1961). Others are exact.
+    /// Refines a focal length, or a similarity that is swept or computed from other data than the trainer's (pattern
+    /// search, Hooke and Jeeves 1961). Others are exact.
     fn refined(&self, best: Trial) -> Result<Trial, CheckError> {
-        if let Mistake::FocalScale(_) = best.mistake {
-            return self.refined_focal(best);
-        }
-        // Directions of the search: scale, three rotations and three translations, up and down.
-        let (directions, least_gain_db) = match best.mistake {
+        // Directions of the search, up and down: focal length or scale, then three rotations and three translations.
+        let (n_directions, mut step, n_halvings, least_gain_db) = match best.mistake {
+            Mistake::FocalScale(_) => (2, FIRST_FOCAL_STEP, HALVINGS, REFINED_GAIN_DB),
+            Mistake::SceneScale(_) => (2, FIRST_STEP, HALVINGS + 2, 0.0),
             Mistake::Frame(FrameCandidate { cause: FrameCause::NerfstudioDefaults, .. }) => {
-                (14, REFINED_GAIN_DB)
+                (14, FIRST_STEP, HALVINGS + 2, REFINED_GAIN_DB)
             }
-            Mistake::SceneScale(_) => (2, 0.0),
             _ => return Ok(best),
-        };
-        let with = |similarity: Similarity| match best.mistake {
-            Mistake::Frame(frame) => Mistake::Frame(FrameCandidate { splat_from_poses: similarity, ..frame }),
-            _ => Mistake::SceneScale(similarity.scale),
         };
         let (centre, diagonal) = (at_per_mille(self.scene, 500), scene_diagonal(self.scene));
         let mut found = best;
-        let mut step = FIRST_STEP;
-        for _ in 0..=HALVINGS + 2 {
-            for direction in 0..directions {
-                let similarity = found.mistake.splat_from_poses().filter(|_| self.goes_on());
-                let Some(similarity) = similarity else { break };
-                let moved = self.trial(with(moved(similarity, direction, step, centre, diagonal)))?;
-                if moved.psnr_db > found.psnr_db {
-                    found = moved;
+        for _ in 0..=n_halvings {
+            for direction in 0..n_directions {
+                if !self.goes_on() {
+                    break;
                 }
+                let step = if direction % 2 == 0 { step } else { -step };
+                let moved = |similarity| moved(similarity, direction / 2, step, centre, diagonal);
+                let moved = self.trial(match found.mistake {
+                    Mistake::Frame(FrameCandidate { cause, splat_from_poses }) => {
+                        Mistake::Frame(FrameCandidate { cause, splat_from_poses: moved(splat_from_poses) })
+                    }
+                    Mistake::SceneScale(factor) => {
+                        Mistake::SceneScale(moved(Similarity::from_scale(factor)).scale)
+                    }
+                    Mistake::FocalScale(factor) => Mistake::FocalScale(factor * f64::exp(step)),
+                    other => other,
+                })?;
+                found = if moved.psnr_db > found.psnr_db { moved } else { found };
             }
             step *= 0.5;
         }
@@ -279,29 +282,11 @@ impl Search<'_> {
     }
 }
 
-impl Search<'_> {
-    /// Refines a factor of focal lengths, of which few are tried.
-    fn refined_focal(&self, best: Trial) -> Result<Trial, CheckError> {
-        let (mut found, mut step) = (best, FIRST_FOCAL_STEP);
-        for _ in 0..=HALVINGS {
-            for step in [step, -step] {
-                if let (Mistake::FocalScale(factor), true) = (found.mistake, self.goes_on()) {
-                    let moved = self.trial(Mistake::FocalScale(factor * f64::exp(step)))?;
-                    found = if moved.psnr_db > found.psnr_db { moved } else { found };
-                }
-            }
-            step *= 0.5;
-        }
-        Ok(if found.psnr_db > best.psnr_db + REFINED_GAIN_DB { found } else { best })
-    }
-}
-
 /// Moves a similarity a step in a direction, about the scene's centre.
 fn moved(similarity: Similarity, direction: usize, step: f64, centre: DVec3, diagonal: f64) -> Similarity {
-    let step = if direction.is_multiple_of(2) { step } else { -step };
     let axis = |at: usize| DVec3::from_array(std::array::from_fn(|i| if i == at { 1.0 } else { 0.0 }));
     let mut change = Similarity::IDENTITY;
-    match direction / 2 {
+    match direction {
         0 => change.scale = step.exp(),
         at @ 1..=3 => change.rotation = DQuat::from_axis_angle(axis(at - 1), step),
         at => change.translation = axis(at - 4) * (step * diagonal),
@@ -353,4 +338,105 @@ fn advice(diagnosis: &Diagnosis, means: &Means) -> Vec<String> {
         ));
     }
     advice
+}
+
+/// A drawing with this PSNR looks much like its photo.
+const ALIKE_DB: f64 = 25.0;
+
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ViewCheck {
+    pub name: String,
+    /// Peak signal-to-noise ratio of the drawing against the photo, dB.
+    pub psnr_db: f64,
+    /// PSNR of a plane of the photo's mean colour, dB: the score without any knowledge of the scene.
+    pub(crate) flat_psnr_db: f64,
+    /// Share of the image that the scene covers (alpha above 0.5).
+    pub(crate) covered_share: f64,
+    pub(crate) visible_gaussians: usize,
+}
+
+impl ViewCheck {
+    /// Returns whether the drawing looks more like the photo than its mean colour does, or much like it: of a bare wall
+    /// the mean colour is hard to surpass.
+    pub fn fits(&self) -> bool {
+        self.psnr_db >= self.flat_psnr_db.min(ALIKE_DB)
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CheckReport {
+    pub views: Vec<ViewCheck>,
+    pub mean_psnr_db: f64,
+    pub(crate) mean_flat_psnr_db: f64,
+    pub mean_covered_share: f64,
+    /// Largest number of Gaussians that cannot be drawn in a view.
+    pub unusable_gaussians: usize,
+    /// Why photos were left out: they cannot be read.
+    pub unreadable: Vec<String>,
+    pub suspicions: Vec<String>,
+    /// What else is known of the inputs, a sentence each.
+    pub notes: Vec<String>,
+    /// Likely mistake; `None` if the drawings match the photos.
+    pub diagnosis: Option<Diagnosis>,
+}
+
+impl fmt::Display for CheckReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "{:<28} {:>8} {:>14} {:>9} {:>10}",
+            "view", "PSNR dB", "plain colour", "covered", "Gaussians"
+        )?;
+        for view in &self.views {
+            let covered = format!("{:.0} %", view.covered_share * 100.0);
+            let (psnr_db, flat_db, n) = (view.psnr_db, view.flat_psnr_db, view.visible_gaussians);
+            writeln!(f, "{:<28} {psnr_db:>8.2} {flat_db:>14.2} {covered:>9} {n:>10}", view.name)?;
+        }
+        let covered = format!("{:.0} %", self.mean_covered_share * 100.0);
+        writeln!(
+            f,
+            "{:<28} {:>8.2} {:>14.2} {covered:>9}",
+            "mean", self.mean_psnr_db, self.mean_flat_psnr_db
+        )?;
+        if let Some(first) = self.unreadable.first() {
+            writeln!(f, "{} photos are left out, the first: {first}", self.unreadable.len())?;
+        }
+        for line in self.suspicions.iter().chain(&self.notes) {
+            writeln!(f, "{line}")?;
+        }
+        match &self.diagnosis {
+            None => writeln!(f, "the drawings match the photos"),
+            Some(diagnosis) => {
+                writeln!(f, "the inputs do not fit together")?;
+                diagnosis.advice.iter().try_for_each(|advice| writeln!(f, "{advice}"))
+            }
+        }
+    }
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub struct CheckOptions {
+    /// Width at which views are compared, pixels. Photos are never enlarged.
+    pub width_px: u32,
+    /// Folder for a picture of each view (photo left, drawing right); `None` writes no pictures.
+    pub pictures_dir: Option<PathBuf>,
+    pub diagnosis_width_px: u32,
+    /// Number of views in which mistakes are searched, spread evenly over all views.
+    pub diagnosis_views: usize,
+    /// Similarities between the worlds of poses and splat that are tried beside common mistakes.
+    pub frames: Vec<FrameCandidate>,
+    pub suspicions: Vec<Suspicion>,
+}
+
+impl Default for CheckOptions {
+    fn default() -> Self {
+        Self {
+            width_px: 800,
+            pictures_dir: None,
+            diagnosis_width_px: 240,
+            diagnosis_views: 4,
+            frames: Vec::new(),
+            suspicions: Vec::new(),
+        }
+    }
 }

@@ -1,54 +1,83 @@
 //! Common mistakes in poses, intrinsics and splats, and their corrections.
 
-use std::fmt;
-
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use serde::Serialize;
 use slag_common::{Gaussians, Similarity, View};
+use slag_math::eigen::eigen_symmetric;
 
 use crate::raster::RasterView;
 
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, thiserror::Error)]
 #[serde(rename_all = "snake_case")]
 pub enum Mistake {
     /// The camera axes are OpenGL's (x right, y up, z back).
+    #[error("the poses have OpenGL camera axes; negate the y and z rows of camera-from-world")]
     OpenGlAxes,
+    #[error("the poses are world-from-camera; invert them")]
     WorldFromCamera,
     /// Both, as in a NeRF `transforms.json`.
+    #[error("the poses are world-from-camera with OpenGL axes; invert them, then negate the y and z rows")]
     WorldFromOpenGlCamera,
     /// The photos are turned by 180 degrees against their cameras.
+    #[error(
+        "the photos are stored upside down against their cameras, perhaps with an EXIF orientation; turn their pixels \
+         (exiftran -a, or mogrify -auto-orient)"
+    )]
     UpsideDown,
     /// The focal lengths must be multiplied by this factor.
+    #[error(
+        "the focal length belongs to another image size or sensor; multiply it by {}",
+        (.0 * 1000.0).round() / 1000.0
+    )]
     FocalScale(f64),
     /// Focal lengths and centre are those of photos this many times as large.
+    #[error(
+        "the intrinsics belong to photos {0:.3} times as large; divide focal lengths and principal point by {0:.3}"
+    )]
     IntrinsicsOfSize(f64),
     /// The principal point is at 0 instead of the middle.
+    #[error("the principal point is at 0; set it to half the width and half the height")]
     CentreAtZero,
     /// Principal point, and perhaps focal lengths, are shares of the image: x and y must be multiplied by these.
-    SharesOfImage {
-        centre_by: [f64; 2],
-        focal_by: [f64; 2],
-    },
+    #[error(
+        "the {} of the image, not pixels; multiply by width and height",
+        if focal_by[0] == 1.0 { "principal point is a share" } else { "intrinsics are shares" }
+    )]
+    SharesOfImage { centre_by: [f64; 2], focal_by: [f64; 2] },
     /// x and y of the principal point are swapped.
+    #[error("x and y of the principal point are swapped; swap them back")]
     CentreSwapped,
     /// The scene is larger than the cameras' world by this factor.
+    #[error(
+        "the scene is {0:.4} times as large as the cameras' world; multiply the camera positions by {0:.4}"
+    )]
     SceneScale(f64),
     /// The worlds differ by right angles: axis i of the splat's is this axis of the cameras', counted from 1, with
     /// its sign.
+    #[error("the worlds of splat and cameras have other axes{}", told_axes(*.0))]
     WorldAxes([i8; 3]),
     /// The worlds differ by a similarity.
+    #[error("{}", .0.cause)]
     Frame(FrameCandidate),
     /// The splat is mirrored along this axis, 0 to 2.
+    #[error(
+        "splat and poses are mirror images along {}; export one of them with right-handed axes",
+        ["x", "y", "z"][(*.0).min(2)]
+    )]
     Mirrored(usize),
     /// The splat's rotations are x, y, z, w where the file's format has w first.
+    #[error("the splat's rotations are x, y, z, w, and its format has w first (rot_0); convert it again")]
     RotationsXyzw,
     /// The splat's rotations turn the other way.
+    #[error("the splat's rotations are inverted, world to Gaussian; convert it again")]
     RotationsInverted,
     /// The splat has scales instead of their logarithms, or opacities instead of logits.
-    Activated {
-        scales: bool,
-        opacities: bool,
-    },
+    #[error("the splat file has {}", match (scales, opacities) {
+        (true, false) => "scales instead of their logarithms; use --activated scales",
+        (false, _) => "opacities instead of logits; use --activated opacities",
+        (true, true) => "scales and opacities instead of logarithms and logits; use --activated scales,opacities",
+    })]
+    Activated { scales: bool, opacities: bool },
 }
 
 /// A similarity between the world of the poses and that of the splat, and why it may hold.
@@ -59,16 +88,25 @@ pub struct FrameCandidate {
 }
 
 /// Why a splat's world may differ from that of its poses.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, thiserror::Error)]
 #[serde(rename_all = "snake_case")]
 pub enum FrameCause {
     /// The splat is in the world of a second set of poses.
+    #[error("the splat is in the world of --also-poses, not in that of --views")]
     OtherPoses,
     /// The splat is an export of nerfstudio in its trained frame, and the file that states it is missing.
+    #[error(
+        "the splat is in nerfstudio's trained frame (oriented, centred and scaled by its defaults); put the run's \
+         dataparser_transforms.json beside the splat"
+    )]
     NerfstudioDefaults,
     /// The stated frame is not that of the splat, which is in the world of the poses.
+    #[error(
+        "the splat is in the world of the poses, not in the frame that the file states; use --splat-frame none"
+    )]
     FrameFileNotMeant,
     /// An offset, such as that of UTM coordinates, is part of one world only.
+    #[error("the splat is shifted against the poses")]
     Shifted,
 }
 
@@ -182,91 +220,6 @@ impl Mistake {
     }
 }
 
-impl fmt::Display for Mistake {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::OpenGlAxes => {
-                write!(f, "the poses have OpenGL camera axes; negate the y and z rows of camera-from-world")
-            }
-            Self::WorldFromCamera => write!(f, "the poses are world-from-camera; invert them"),
-            Self::WorldFromOpenGlCamera => write!(
-                f,
-                "the poses are world-from-camera with OpenGL axes; invert them, then negate the y and z rows"
-            ),
-            Self::UpsideDown => write!(
-                f,
-                "the photos are stored upside down against their cameras, perhaps with an EXIF orientation; turn their \
-                 pixels (exiftran -a, or mogrify -auto-orient)"
-            ),
-            Self::FocalScale(factor) => {
-                let factor = (factor * 1000.0).round() / 1000.0;
-                write!(f, "the focal length belongs to another image size or sensor; multiply it by {factor}")
-            }
-            Self::IntrinsicsOfSize(factor) => write!(
-                f,
-                "the intrinsics belong to photos {factor:.3} times as large; divide focal lengths and principal point by \
-                 {factor:.3}"
-            ),
-            Self::CentreAtZero => {
-                write!(f, "the principal point is at 0; set it to half the width and half the height")
-            }
-            Self::SharesOfImage { focal_by, .. } => {
-                let what =
-                    if focal_by[0] == 1.0 { "principal point is a share" } else { "intrinsics are shares" };
-                write!(f, "the {what} of the image, not pixels; multiply by width and height")
-            }
-            Self::CentreSwapped => write!(f, "x and y of the principal point are swapped; swap them back"),
-            Self::SceneScale(factor) => write!(
-                f,
-                "the scene is {factor:.4} times as large as the cameras' world; multiply the camera positions by \
-                 {factor:.4}"
-            ),
-            Self::WorldAxes(axes) => write_axes(*axes, f),
-            Self::Frame(frame) => write!(f, "{}", frame.cause),
-            Self::Mirrored(axis) => {
-                let axis = ["x", "y", "z"][(*axis).min(2)];
-                write!(
-                    f,
-                    "splat and poses are mirror images along {axis}; export one of them with right-handed axes"
-                )
-            }
-            Self::RotationsXyzw => write!(
-                f,
-                "the splat's rotations are x, y, z, w, and its format has w first (rot_0); convert it again"
-            ),
-            Self::RotationsInverted => {
-                write!(f, "the splat's rotations are inverted, world to Gaussian; convert it again")
-            }
-            Self::Activated { scales, opacities } => {
-                let (what, flag) = match (scales, opacities) {
-                    (true, false) => ("scales instead of their logarithms", "scales"),
-                    (false, _) => ("opacities instead of logits", "opacities"),
-                    (true, true) => {
-                        ("scales and opacities instead of logarithms and logits", "scales,opacities")
-                    }
-                };
-                write!(f, "the splat file has {what}; use --activated {flag}")
-            }
-        }
-    }
-}
-
-impl fmt::Display for FrameCause {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::OtherPoses => "the splat is in the world of --also-poses, not in that of --views",
-            Self::NerfstudioDefaults => {
-                "the splat is in nerfstudio's trained frame (oriented, centred and scaled by its defaults); put the \
-                 run's dataparser_transforms.json beside the splat"
-            }
-            Self::FrameFileNotMeant => {
-                "the splat is in the world of the poses, not in the frame that the file states; use --splat-frame none"
-            }
-            Self::Shifted => "the splat is shifted against the poses",
-        })
-    }
-}
-
 /// Returns the frames in which nerfstudio trains by default: cameras centred at their mean, the mean of their up
 /// axes turned to z, scaled so that the largest coordinate of a camera is 1 (`auto_orient_and_center_poses`,
 /// methods `up` of its own data sets and `none` of ScanNet), each with and without a change of axes from COLMAP's.
@@ -322,7 +275,7 @@ fn right_angles() -> Vec<[i8; 3]> {
     all
 }
 
-fn write_axes(axes: [i8; 3], f: &mut fmt::Formatter<'_>) -> fmt::Result {
+fn told_axes(axes: [i8; 3]) -> String {
     let name = |axis: i8| {
         let letter = ["x", "y", "z"][usize::from(axis.unsigned_abs().clamp(1, 3)) - 1];
         if axis < 0 { format!("-{letter}") } else { letter.to_owned() }
@@ -335,8 +288,119 @@ fn write_axes(axes: [i8; 3], f: &mut fmt::Formatter<'_>) -> fmt::Result {
         [1, -2, -3] => " (y and z negated: OpenGL's world against OpenCV's)",
         _ => "",
     };
-    write!(
-        f,
-        "the worlds of splat and cameras have other axes{cause}: the splat's x, y, z are the cameras' {x}, {y}, {z}"
-    )
+    format!("{cause}: the splat's x, y, z are the cameras' {x}, {y}, {z}")
+}
+
+const MIN_CAMERAS: usize = 3;
+/// Cameras whose second-largest spread is below this share of the largest stand on a line: the rotation about it
+/// is undetermined.
+const MIN_SPREAD: f64 = 1e-3;
+/// Points nearer than this to their mean, relative to its distance from the origin, coincide.
+const ROUNDING: f64 = 1e-12;
+
+/// The similarity that best maps one set of camera centres to another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Alignment {
+    /// From the first set's world to the second's.
+    pub similarity: Similarity,
+    pub(crate) n_cameras: usize,
+    /// RMS of the remaining distances, over the RMS distance of the second set's cameras from their mean.
+    pub(crate) residual: f64,
+}
+
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+pub enum AlignError {
+    #[error(
+        "{n} photos are in both sets of poses, at least {MIN_CAMERAS} are needed; give poses of the same photos, with \
+         the same file names"
+    )]
+    Few { n: usize },
+    #[error(
+        "the cameras of one set of poses stand on a line or in one point, which leaves the rotation undetermined; \
+         give poses of more photos"
+    )]
+    Line,
+}
+
+/// Aligns two sets of poses by the centres of views with equal names, or else equal file stems.
+pub fn align(from: &[View], to: &[View]) -> Result<Alignment, AlignError> {
+    let pairs_by = |key: fn(&View) -> &str| -> Vec<(DVec3, DVec3)> {
+        let mut known: std::collections::BTreeMap<&str, Option<&View>> = std::collections::BTreeMap::new();
+        for view in to {
+            // A key shared by two views is ambiguous.
+            known.entry(key(view)).and_modify(|known| *known = None).or_insert(Some(view));
+        }
+        let pair = |view: &View| {
+            let other = (*known.get(key(view))?)?;
+            Some((view.position_in_world(), other.position_in_world()))
+        };
+        from.iter().filter_map(pair).collect()
+    };
+    let by_name = pairs_by(|view| &view.name);
+    if by_name.len() >= MIN_CAMERAS { similarity(&by_name) } else { similarity(&pairs_by(stem)) }
+}
+
+fn stem(view: &View) -> &str {
+    let file = view.name.rsplit('/').next().unwrap_or(&view.name);
+    file.rsplit_once('.').map_or(file, |(stem, _)| stem)
+}
+
+/// Least-squares similarity from the first points to the second: Umeyama (1991), equations 34 to 43, with the rotation
+/// by Horn's quaternion (1987), which is never a reflection.
+fn similarity(pairs: &[(DVec3, DVec3)]) -> Result<Alignment, AlignError> {
+    let n = pairs.len();
+    if n < MIN_CAMERAS {
+        return Err(AlignError::Few { n });
+    }
+    let mean = |point: fn(&(DVec3, DVec3)) -> DVec3| pairs.iter().map(point).sum::<DVec3>() / n as f64;
+    let (from_mean, to_mean) = (mean(|pair| pair.0), mean(|pair| pair.1));
+    let centred: Vec<(DVec3, DVec3)> = pairs.iter().map(|(a, b)| (*a - from_mean, *b - to_mean)).collect();
+    type Side = fn(&(DVec3, DVec3)) -> DVec3;
+    let sides: [(Side, DVec3); 2] = [(|pair| pair.0, from_mean), (|pair| pair.1, to_mean)];
+    for (side, mean) in sides {
+        // Equal points differ from their mean by rounding.
+        let rounding = n as f64 * (ROUNDING * mean.length()).powi(2);
+        let mut covariance = vec![0.0; 9];
+        for point in centred.iter().map(side) {
+            for (at, entry) in covariance.iter_mut().enumerate() {
+                *entry += point[at / 3] * point[at % 3];
+            }
+        }
+        let (values, _) = eigen_symmetric(covariance, 3);
+        if !(values[0] > rounding && values[1] > MIN_SPREAD * MIN_SPREAD * values[0]) {
+            return Err(AlignError::Line);
+        }
+    }
+    // sums[i][j]: the sum of from_i to_j.
+    let mut sums = [[0.0; 3]; 3];
+    for (a, b) in &centred {
+        for (i, row) in sums.iter_mut().enumerate() {
+            for (j, sum) in row.iter_mut().enumerate() {
+                *sum += a[i] * b[j];
+            }
+        }
+    }
+    let [[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]] = sums;
+    #[rustfmt::skip]
+    let quaternion_form = vec![
+        xx + yy + zz, yz - zy,       zx - xz,       xy - yx,
+        yz - zy,      xx - yy - zz,  xy + yx,       zx + xz,
+        zx - xz,      xy + yx,       yy - xx - zz,  yz + zy,
+        xy - yx,      zx + xz,       yz + zy,       zz - xx - yy,
+    ];
+    let (_, vectors) = eigen_symmetric(quaternion_form, 4);
+    let rotation = DQuat::from_xyzw(vectors[1], vectors[2], vectors[3], vectors[0]).normalize();
+    let (mut along, mut from_squares, mut to_squares) = (0.0, 0.0, 0.0);
+    for (a, b) in &centred {
+        along += b.dot(rotation * *a);
+        from_squares += a.length_squared();
+        to_squares += b.length_squared();
+    }
+    let scale = along / from_squares;
+    if !(scale > 0.0 && scale.is_finite()) {
+        return Err(AlignError::Line);
+    }
+    let found = Similarity { scale, rotation, translation: to_mean - rotation * from_mean * scale };
+    let squares: f64 = pairs.iter().map(|(a, b)| found.transform_point(*a).distance_squared(*b)).sum();
+    Ok(Alignment { similarity: found, n_cameras: n, residual: (squares / to_squares).sqrt() })
 }

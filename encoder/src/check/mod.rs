@@ -3,12 +3,8 @@
 //! The check draws sample views of the scene, compares each with its photo and, where they differ, looks for
 //! common mistakes in poses, intrinsics and splat.
 
-mod align;
 mod diagnosis;
-mod error;
 mod mistake;
-mod options;
-mod report;
 mod suspicion;
 #[cfg(test)]
 mod tests;
@@ -17,19 +13,16 @@ mod view;
 use slag_common::{Gaussians, durable};
 
 use crate::ingest::IngestError;
-use crate::raster::{LoadedScene, Rasterizer};
+use crate::raster::Rasterizer;
 use diagnosis::{FLAWLESS_DB, Means, Samples};
 use view::{PLAIN_DB, at_width, mean, picture, picture_name};
 
-pub(crate) use align::Alignment;
-pub use align::align;
-pub use error::CheckError;
-pub use mistake::{FrameCandidate, FrameCause, Mistake, nerfstudio_defaults};
-pub use options::CheckOptions;
-pub use report::CheckReport;
-pub(crate) use report::ViewCheck;
+pub(crate) use diagnosis::ViewCheck;
+pub use diagnosis::{CheckOptions, CheckReport};
+pub(crate) use mistake::Alignment;
+pub use mistake::{FrameCandidate, FrameCause, Mistake, align, nerfstudio_defaults};
 pub use suspicion::{Suspicion, suspicions};
-pub use view::{CheckView, psnr_db};
+pub use view::{CheckError, CheckView, psnr_db};
 
 /// Draws the views of a scene and compares them with their photos.
 ///
@@ -49,14 +42,44 @@ where
     V: IntoIterator<Item = Result<CheckView, IngestError>, IntoIter: ExactSizeIterator>,
 {
     let views = views.into_iter();
-    if views.len() == 0 {
+    let n_views = views.len();
+    if n_views == 0 {
         return Err(CheckError::NoViews);
     }
     if let Some(dir) = &options.pictures_dir {
         fs_err::create_dir_all(dir)?;
     }
     let loaded = rasterizer.load(scene)?;
-    let Compared { checks, unreadable, unusable_gaussians, samples } = compare(views, &*loaded, options)?;
+    let (mut checks, mut unreadable) = (Vec::with_capacity(n_views), Vec::<IngestError>::new());
+    let mut unusable_gaussians = 0;
+    let mut samples = Samples::new(n_views, options.diagnosis_views, options.diagnosis_width_px);
+    for (index, view) in views.enumerate() {
+        let view = match view {
+            Ok(view) => view,
+            Err(error) => {
+                unreadable.push(error);
+                continue;
+            }
+        };
+        let small = at_width(&view, options.width_px)?;
+        let drawing = small.draw(&*loaded)?;
+        unusable_gaussians = unusable_gaussians.max(drawing.counters.unusable);
+        if let Some(dir) = &options.pictures_dir {
+            let picture = picture(&small, &drawing)?;
+            durable::write(&dir.join(picture_name(index, &view.name)), &picture)?;
+        }
+        checks.push(ViewCheck {
+            name: view.name.clone(),
+            psnr_db: small.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]),
+            flat_psnr_db: small.flat_psnr_db(),
+            covered_share: mean(drawing.coverage.iter().map(|&alpha| f64::from(u8::from(alpha > 0.5)))),
+            visible_gaussians: drawing.counters.visible,
+        });
+        samples.add(index, &view)?;
+    }
+    if checks.is_empty() {
+        return Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) });
+    }
     let means = means_of(&checks);
     let mut suspicions: Vec<String> =
         options.suspicions.iter().map(|suspicion| suspicion.text.clone()).collect();
@@ -80,53 +103,6 @@ where
         notes: Vec::new(),
         diagnosis,
     })
-}
-
-/// Results for the views with readable photos, and samples for the diagnosis.
-struct Compared {
-    checks: Vec<ViewCheck>,
-    unreadable: Vec<IngestError>,
-    unusable_gaussians: usize,
-    samples: Samples,
-}
-
-fn compare(
-    views: impl ExactSizeIterator<Item = Result<CheckView, IngestError>>,
-    scene: &dyn LoadedScene,
-    options: &CheckOptions,
-) -> Result<Compared, CheckError> {
-    let n_views = views.len();
-    let (mut checks, mut unreadable) = (Vec::with_capacity(n_views), Vec::new());
-    let mut unusable_gaussians = 0;
-    let mut samples = Samples::new(n_views, options.diagnosis_views, options.diagnosis_width_px);
-    for (index, view) in views.enumerate() {
-        let view = match view {
-            Ok(view) => view,
-            Err(error) => {
-                unreadable.push(error);
-                continue;
-            }
-        };
-        let small = at_width(&view, options.width_px)?;
-        let drawing = small.draw(scene)?;
-        unusable_gaussians = unusable_gaussians.max(drawing.counters.unusable);
-        if let Some(dir) = &options.pictures_dir {
-            let picture = picture(&small, &drawing)?;
-            durable::write(&dir.join(picture_name(index, &view.name)), &picture)?;
-        }
-        checks.push(ViewCheck {
-            name: view.name.clone(),
-            psnr_db: small.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]),
-            flat_psnr_db: small.flat_psnr_db(),
-            covered_share: mean(drawing.coverage.iter().map(|&alpha| f64::from(u8::from(alpha > 0.5)))),
-            visible_gaussians: drawing.counters.visible,
-        });
-        samples.add(index, &view)?;
-    }
-    match checks.is_empty() {
-        true => Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) }),
-        false => Ok(Compared { checks, unreadable, unusable_gaussians, samples }),
-    }
 }
 
 fn means_of(checks: &[ViewCheck]) -> Means {

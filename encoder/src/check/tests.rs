@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use slag_common::{Similarity, View};
 
-use super::align::AlignError;
+use super::mistake::AlignError;
 use super::{FrameCause, Mistake, Suspicion, ViewCheck, align, means_of, nerfstudio_defaults, suspicions};
 use crate::raster::{RasterView, pinhole};
 
@@ -182,6 +182,14 @@ fn most_views_must_fit() {
     assert_eq!(fit(2, 2, 1), (true, false));
     assert_eq!(fit(3, 2, 3), (true, true));
     assert_eq!(fit(0, 5, 0), (false, false));
+    // A bare wall drawn well, and a black photo, whose own colour is exact.
+    assert!(checked(31.0, 40.0).fits() && !checked(5.0, f64::INFINITY).fits());
+}
+
+/// Ten Gaussians, where the cameras are.
+fn scene_of(views: &[View]) -> slag_common::Gaussians {
+    let scene = slag_common::Gaussians::balls(views.iter().map(View::position_in_world).collect(), 0.1);
+    scene.select(&[0, 1, 2, 3, 4, 5, 0, 1, 2, 3])
 }
 
 /// Intrinsics of photos of 640 x 480 pixels as people have them wrong, and right.
@@ -196,8 +204,7 @@ fn intrinsics_of_no_camera_are_suspected() {
             ..pinhole([640, 480], 1.0)
         };
         let views: Vec<View> = views(&FROM).into_iter().map(|view| View { intrinsics, ..view }).collect();
-        let scene = slag_common::Gaussians::balls(views.iter().map(View::position_in_world).collect(), 0.1);
-        let scene = scene.select(&[0, 1, 2, 3, 4, 5, 0, 1, 2, 3]);
+        let scene = scene_of(&views);
         suspicions(&scene, &views)
     };
     let middle = [320.0, 240.0];
@@ -242,8 +249,7 @@ fn intrinsics_of_no_camera_are_suspected() {
 #[test]
 fn poses_that_repeat_are_suspected() {
     let mut views = views(&FROM);
-    let scene = slag_common::Gaussians::balls(views.iter().map(View::position_in_world).collect(), 0.1);
-    let scene = scene.select(&[0, 1, 2, 3, 4, 5, 0, 1, 2, 3]);
+    let scene = scene_of(&views);
     views[1].camera_from_world = views[0].camera_from_world;
     assert_eq!(suspicions(&scene, &views), []);
     let n = views.len();

@@ -5,8 +5,8 @@ use std::io::Cursor;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat, RgbImage};
 
-use super::error::CheckError;
-use crate::raster::{Drawing, LoadedScene, RasterView};
+use crate::ingest::IngestError;
+use crate::raster::{Drawing, LoadedScene, RasterError, RasterView};
 
 #[derive(Clone, Debug)]
 pub struct CheckView {
@@ -39,15 +39,6 @@ pub(super) fn at_width(view: &CheckView, width_px: u32) -> Result<CheckView, Che
     Ok(CheckView { name: view.name.clone(), image, valid, view: RasterView { intrinsics, ..view.view } })
 }
 
-impl CheckView {
-    /// Draws the view over black, like trainers of splats.
-    pub(super) fn draw(&self, scene: &dyn LoadedScene) -> Result<Drawing, CheckError> {
-        scene
-            .draw(&self.view, [0.0; 3])
-            .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
-    }
-}
-
 /// PSNR of a picture against a photo, dB; 100 where they are equal.
 pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
     let squares = photo.pixels().enumerate().flat_map(|(pixel, photo)| {
@@ -64,6 +55,13 @@ pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
 pub(super) const PLAIN_DB: f64 = 40.0;
 
 impl CheckView {
+    /// Draws the view over black, like trainers of splats.
+    pub(super) fn draw(&self, scene: &dyn LoadedScene) -> Result<Drawing, CheckError> {
+        scene
+            .draw(&self.view, [0.0; 3])
+            .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
+    }
+
     pub(super) fn is_plain(&self) -> bool {
         self.flat_psnr_db() >= PLAIN_DB
     }
@@ -112,4 +110,25 @@ pub(super) fn picture_name(index: usize, view_name: &str) -> String {
 pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, n) = values.fold((0.0, 0_usize), |(sum, n), v| (sum + v, n + 1));
     sum / n.max(1) as f64
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum CheckError {
+    #[error("no views to check; give at least one photo with its pose")]
+    NoViews,
+    #[error("none of the {n_views} sampled photos can be read, the first: {first}")]
+    NoPhotos { n_views: usize, first: IngestError },
+    #[error(
+        "view {view}: the photo has {} x {} px but its camera {} x {} px; give the photo that the camera describes",
+        image_px[0], image_px[1], camera_px[0], camera_px[1]
+    )]
+    ImageSize { view: String, image_px: [u32; 2], camera_px: [u32; 2] },
+    #[error("view {view}: {source}")]
+    Raster { view: String, source: RasterError },
+    #[error(transparent)]
+    Scene(#[from] RasterError),
+    #[error("view {view}: cannot encode its picture ({source}); choose a smaller width")]
+    Encode { view: String, source: image::ImageError },
+    #[error("{0}; choose another folder for the pictures")]
+    Write(#[from] std::io::Error),
 }

@@ -6,15 +6,12 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use image::GrayImage;
 use slag_common::poses::SplatFrame;
-use slag_common::{Gaussians, Similarity, View, durable, files, poses, splat};
+use slag_common::{View, durable, files, poses, splat};
 
 use super::common::{Exit, InputArgs, print};
 use super::memory::free_memory_bytes;
-use super::next;
-use super::outputs;
-use crate::check::{
-    self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Suspicion,
-};
+use super::{common, next};
+use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
 use crate::ingest::{self, FoundFrame, IngestError, LoadedImage, OddPhotos};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
@@ -56,9 +53,8 @@ pub struct CheckArgs {
 pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     let mut read = args.input.paths_read();
     read.extend(args.also_poses.as_deref());
-    outputs::check(args.write_frame.as_deref(), &read, None)?;
-    let inputs = Inputs::read(args)?;
-    let (report, is_partial) = checked(args, inputs)?;
+    common::check(args.write_frame.as_deref(), &read, None)?;
+    let (report, is_partial) = checked(args)?;
     let next = if report.diagnosis.is_none() { next::of_check(&args.input) } else { String::new() };
     print(json, &report, format!("{report}{next}"))?;
     Ok(match (&report.diagnosis, is_partial) {
@@ -68,57 +64,42 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     })
 }
 
-struct Inputs {
-    scene: Gaussians,
-    views: Vec<View>,
-    /// The similarity that a file states; the cameras are moved by it already.
-    stated: Option<Similarity>,
-    frames: Vec<FrameCandidate>,
-    suspicions: Vec<Suspicion>,
-    notes: Vec<String>,
-    is_partial: bool,
-}
-
-impl Inputs {
-    fn read(args: &CheckArgs) -> Result<Self> {
-        let input = &args.input;
-        let mut scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
-        input.activated.undo(&mut scene);
-        let views = input.views.as_ref();
-        let views = views.context("check compares the splat with photos; give their poses with --views")?;
-        args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;
-        let mut set = poses::read(views, input.images.as_deref())?;
-        let mut notes = set.notes.clone();
-        let drawn_from = ingest::drawn_from(views);
-        notes.extend(drawn_from.as_ref().map(|splat| {
-            format!("the images are no photos: they were drawn from {splat}, so that they fit says little")
-        }));
-        let frame = match drawn_from {
-            Some(_) => None,
-            None => ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?,
-        };
-        let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;
-        if let Some(n) = input.every {
-            set = set.every(n);
-        }
-        notes.extend(set.left_out());
-        let n_left_out = set.damaged.len();
-        let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
-        let mut all = set.views;
-        if let Some(stated) = stated {
-            all.iter_mut()
-                .for_each(|view| view.camera_from_world = stated.camera_from_target(view.camera_from_world));
-        }
-        let (n_views, suspicions) = (all.len(), check::suspicions(&scene, &all));
-        let views = with_photos(all, input.strict, &mut notes)?;
-        let is_partial = n_left_out > 0 || views.len() < n_views;
-        Ok(Self { scene, views, stated, frames, suspicions, notes, is_partial })
-    }
-}
-
 /// Returns the report, and whether something was left out or does not fit.
-fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
-    let Inputs { scene, views, stated, frames, suspicions, mut notes, is_partial } = inputs;
+fn checked(args: &CheckArgs) -> Result<(CheckReport, bool)> {
+    let input = &args.input;
+    let mut scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
+    input.activated.undo(&mut scene);
+    let poses = input.views.as_ref();
+    let poses = poses.context("check compares the splat with photos; give their poses with --views")?;
+    args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;
+    let mut set = poses::read(poses, input.images.as_deref())?;
+    let mut notes = set.notes.clone();
+    let frame = match ingest::drawn_from(poses) {
+        Some(splat) => {
+            notes.push(format!(
+                "the images are no photos: they were drawn from {splat}, so that they fit says little"
+            ));
+            None
+        }
+        None => ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?,
+    };
+    let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;
+    if let Some(n) = input.every {
+        set = set.every(n);
+    }
+    notes.extend(set.left_out());
+    let n_left_out = set.damaged.len();
+    // The similarity that a file states: the cameras are moved by it.
+    let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
+    let mut views = set.views;
+    if let Some(stated) = stated {
+        for view in &mut views {
+            view.camera_from_world = stated.camera_from_target(view.camera_from_world);
+        }
+    }
+    let (n_views, suspicions) = (views.len(), check::suspicions(&scene, &views));
+    let views = with_photos(views, input.strict, &mut notes)?;
+    let is_partial = n_left_out > 0 || views.len() < n_views;
     let n = (args.samples as usize).min(views.len());
     // Photos are loaded one at a time, when the check reaches them.
     let odd = OddPhotos::default();
@@ -133,7 +114,7 @@ fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
     let devices = Devices::open(&args.device, GpuOptions::default())?;
     let mut report = check::check(&scene, photos, &devices, &options)?;
     odd.warn();
-    if let (true, Some(first)) = (args.input.strict, report.unreadable.first()) {
+    if let (true, Some(first)) = (input.strict, report.unreadable.first()) {
         return Err(anyhow!("{first}"));
     }
     // Cameras are in the stated frame already; reports and files begin at the poses.

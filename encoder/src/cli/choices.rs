@@ -121,15 +121,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn limits_and_widths_are_numbers_or_words() {
-        assert_eq!(parse_views_limit("7"), Ok(ViewsLimit::Count(7)));
-        assert_eq!(parse_views_limit("12.5%"), Ok(ViewsLimit::Share(0.125)));
-        assert_eq!(parse_raster_width("photo"), Ok(RasterWidth::Photo));
-        assert_eq!(parse_raster_width("16"), Ok(RasterWidth::Px(16)));
-        assert!(parse_raster_width("twice").is_err() && parse_views_limit("-1").is_err());
-    }
-
-    #[test]
     fn a_limit_leaves_a_view_and_takes_no_more_than_there_are() {
         let of_36 =
             [ViewsLimit::All, ViewsLimit::Count(99), ViewsLimit::Share(0.25), ViewsLimit::Share(0.001)];

@@ -1,6 +1,6 @@
 //! `diff`: what changed between two generations.
 
-use std::fmt;
+use std::fmt::{self, Write};
 use std::path::PathBuf;
 
 use anyhow::{Result, anyhow};
@@ -63,7 +63,7 @@ pub(super) fn run(args: &DiffArgs, json: bool) -> Result<Exit> {
             diff::diff(old, Generation { reader: &old_reader, published: old_reader.current() })
         }
     }?;
-    print(json, &found, Lines(&found))?;
+    print(json, &found, lines(&found)?)?;
     Ok(Exit::Done)
 }
 
@@ -83,49 +83,46 @@ fn generation(reader: &StoreReader, number: Option<u64>) -> Result<Generation<'_
     Ok(Generation { reader, published })
 }
 
-struct Lines<'a>(&'a Diff);
-
-impl fmt::Display for Lines<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let diff = self.0;
-        let unit = if diff.metric { " m" } else { "" };
-        let place = |thing: &Thing| {
-            let [[x, y, z], [w, d, h]] =
-                [thing.position_in_world, thing.box_in_world.size()].map(|v| v.to_array());
-            let (id, n, photo) = (thing.id, thing.n_gaussians, &thing.photo);
-            format!(
-                "{id:016x} at {x:.2} {y:.2} {z:.2}, {w:.2} x {d:.2} x {h:.2}{unit}, {n} Gaussians, in {photo}"
-            )
-        };
-        writeln!(f, "generation {} to {}", diff.old_generation, diff.new_generation)?;
-        for thing in &diff.appeared {
-            writeln!(f, "appeared  {}", place(thing))?;
-        }
-        for thing in &diff.went {
-            writeln!(f, "went      {}", place(thing))?;
-        }
-        for moved in &diff.moved {
-            writeln!(
-                f,
-                "moved     {:.2}{unit}: {}; was {}",
-                moved.distance,
-                place(&moved.to),
-                place(&moved.from)
-            )?;
-        }
-        let n_alike = diff.n_same + diff.n_stayed;
-        writeln!(f, "things    {n_alike} stayed, {} of them unchanged", diff.n_same)?;
-        if diff.n_not_compared > 0 {
-            writeln!(
-                f,
-                "          {} are outlined in another way where the splat is the same",
-                diff.n_not_compared
-            )?;
-        }
-        let bytes = diff.fetch_bytes.iter().map(|(profile, n)| format!("{profile} {}", ByteSize(*n)));
-        let bytes = bytes.collect::<Vec<_>>().join(", ");
-        writeln!(f, "to fetch  {} of {} cells: {bytes}", diff.n_cells_changed, diff.n_cells)
+fn lines(diff: &Diff) -> Result<String, fmt::Error> {
+    let mut lines = String::new();
+    let unit = if diff.metric { " m" } else { "" };
+    let place = |thing: &Thing| {
+        let [[x, y, z], [w, d, h]] =
+            [thing.position_in_world, thing.box_in_world.size()].map(|v| v.to_array());
+        let (id, n, photo) = (thing.id, thing.n_gaussians, &thing.photo);
+        format!(
+            "{id:016x} at {x:.2} {y:.2} {z:.2}, {w:.2} x {d:.2} x {h:.2}{unit}, {n} Gaussians, in {photo}"
+        )
+    };
+    writeln!(lines, "generation {} to {}", diff.old_generation, diff.new_generation)?;
+    for thing in &diff.appeared {
+        writeln!(lines, "appeared  {}", place(thing))?;
     }
+    for thing in &diff.went {
+        writeln!(lines, "went      {}", place(thing))?;
+    }
+    for moved in &diff.moved {
+        writeln!(
+            lines,
+            "moved     {:.2}{unit}: {}; was {}",
+            moved.distance,
+            place(&moved.to),
+            place(&moved.from)
+        )?;
+    }
+    let n_alike = diff.n_same + diff.n_stayed;
+    writeln!(lines, "things    {n_alike} stayed, {} of them unchanged", diff.n_same)?;
+    if diff.n_not_compared > 0 {
+        writeln!(
+            lines,
+            "          {} are outlined in another way where the splat is the same",
+            diff.n_not_compared
+        )?;
+    }
+    let bytes = diff.fetch_bytes.iter().map(|(profile, n)| format!("{profile} {}", ByteSize(*n)));
+    let bytes = bytes.collect::<Vec<_>>().join(", ");
+    writeln!(lines, "to fetch  {} of {} cells: {bytes}", diff.n_cells_changed, diff.n_cells)?;
+    Ok(lines)
 }
 
 #[cfg(test)]

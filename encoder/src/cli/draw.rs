@@ -10,9 +10,8 @@ use serde_json::json;
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Gaussians, View, poses};
 
-use super::common::{Exit, print};
+use super::common::{self, Exit, folder_of, print};
 use super::memory::default_memory_bytes;
-use super::outputs::{self, folder_of};
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -89,7 +88,7 @@ impl DrawingArgs {
     fn open(&self, views: Option<&Path>) -> Result<(Gaussians, Devices, String)> {
         let read = [Some(self.scene.as_path()), views].into_iter().flatten();
         let read: Vec<&Path> = read.flat_map(|path| [path, folder_of(path)]).collect();
-        outputs::check([self.out.as_path()], &read, None)?;
+        common::check([self.out.as_path()], &read, None)?;
         viewpoints::check_folder(&self.out)?;
         let scene = splat::read(&self.scene, &ReadOptions { with_sh_rest: true })?;
         let name = self.scene.file_name().unwrap_or_default().to_string_lossy().into_owned();

@@ -19,9 +19,8 @@ use super::common::{
 };
 use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
-use super::next;
-use super::outputs;
 use super::summary::lines;
+use super::{common, next};
 use crate::cells::PositionError;
 use crate::encode::front::{Expectation, Front, Target};
 use crate::encode::{
@@ -186,22 +185,8 @@ fn parse_name(text: &str) -> Result<String, String> {
 }
 
 /// Names that trainers give to any splat or folder.
-const NAMES_OF_TRAINERS: [&str; 14] = [
-    "data",
-    "export",
-    "iteration",
-    "meta",
-    "model",
-    "out",
-    "output",
-    "outputs",
-    "ply",
-    "point_cloud",
-    "results",
-    "scene",
-    "splat",
-    "tmp",
-];
+const NAMES_OF_TRAINERS: &str =
+    "data export iteration meta model out output outputs ply point_cloud results scene splat tmp";
 
 /// Name of a splat: of its file, or of the nearest folder above with a name of its own.
 fn name_of(splat: &Path) -> Option<String> {
@@ -209,7 +194,7 @@ fn name_of(splat: &Path) -> Option<String> {
     let name = |part: &OsStr| Some(part.to_str()?.split('.').next()?.to_owned());
     let is_own = |name: &String| {
         let word = name.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches(['_', '-']);
-        !word.is_empty() && !NAMES_OF_TRAINERS.contains(&word.to_lowercase().as_str())
+        !word.is_empty() && !NAMES_OF_TRAINERS.split(' ').any(|known| known == word.to_lowercase())
     };
     let names = path.ancestors().filter_map(|part| name(part.file_name()?));
     names.filter(|name| parse_name(name).is_ok()).find(is_own)
@@ -287,8 +272,8 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
 
 /// Where masks come from, if not from the embedded model.
 fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
-    let ignore_ids = || args.ignore_mask_ids.clone();
-    let (own, other) = (!["auto", "graph"].contains(&args.masks.as_str()), args.sam.segmenter.is_some());
+    let other = args.sam.segmenter.is_some();
+    let own = !["auto", "graph"].contains(&args.masks.as_str());
     if !own && !args.ignore_mask_ids.is_empty() {
         return Err(anyhow!(
             "--ignore-mask-ids is for masks of your own; give these with --masks, or leave it out"
@@ -302,24 +287,23 @@ fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
     match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
         ("auto", of_sam) => Ok(of_sam),
         ("graph", None) => Ok(Some(Masks::Graph)),
-        (dir, None) => Ok(Some(Masks::Given { dir: dir.into(), ignore_ids: ignore_ids() })),
+        (dir, None) => {
+            let ignore_ids = args.ignore_mask_ids.clone();
+            Ok(Some(Masks::Given { dir: dir.into(), ignore_ids }))
+        }
         (dir, Some(_)) => Err(anyhow!("--masks {dir} and --segmenter exclude each other; give one of them")),
     }
 }
 
-/// Settings of the flags, with a target's choices, and what is expected of them.
-fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expectation>)> {
-    let settings = settings(args, &args.choices)?;
-    match args.target.choose(&settings.inputs)? {
-        Some((choices, expected)) => Ok((self::settings(args, &choices)?, Some(expected))),
-        None => Ok((settings, None)),
-    }
-}
-
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    outputs::check(args.report.as_deref(), &args.paths_read(), Some(&args.store))?;
+    common::check(args.report.as_deref(), &args.paths_read(), Some(&args.store))?;
     args.report.iter().try_for_each(|path| files::check_writable(path))?;
-    let (mut settings, expected) = settings_and_target(args)?;
+    let mut settings = settings(args, &args.choices)?;
+    let target = args.target.choose(&settings.inputs)?;
+    if let Some((choices, _)) = &target {
+        settings = self::settings(args, choices)?;
+    }
+    let expected = target.map(|(_, expected)| expected);
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     settings.run.gpus = args.gpus.numbers(&session);

@@ -1,11 +1,11 @@
 //! `keys`: the keys of a store's roles.
 
-use std::fmt;
+use std::fmt::{self, Write};
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand, ValueEnum};
-use serde::Serialize;
+use serde_json::json;
 use slag_common::tuf::format_utc;
 
 use super::common::{Exit, print, warn_of_expiry};
@@ -144,7 +144,7 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
             let n_keys = sign_draft(draft, root_keys)?;
             let line =
                 format!("signed with {n_keys} keys; next: slag-encoder keys install, where the store lies\n");
-            print(json, &Signed { n_keys }, line)?;
+            print(json, &json!({ "n_keys": n_keys }), line)?;
             Ok(Exit::Done)
         }
         KeysCommand::Install { draft, at } => {
@@ -154,13 +154,8 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
     }
 }
 
-#[derive(Serialize)]
-struct Signed {
-    n_keys: usize,
-}
-
 fn show(json: bool, status: &KeysStatus) -> Result<Exit> {
-    print(json, status, Lines(status))?;
+    print(json, status, lines(status)?)?;
     Ok(Exit::Done)
 }
 
@@ -180,21 +175,17 @@ fn changed(json: bool, changed: &Changed) -> Result<Exit> {
     Ok(Exit::Done)
 }
 
-struct Lines<'a>(&'a KeysStatus);
-
-impl fmt::Display for Lines<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let status = self.0;
-        let expires = format_utc(status.root_expires_unix_secs);
-        writeln!(f, "root       {} until {expires}", status.root_version)?;
-        writeln!(f, "SHA-256    {}", status.root_sha256)?;
-        writeln!(f, "threshold  {}", status.threshold)?;
-        let timestamp = status.timestamp_expires_unix_secs.map_or("not published yet".into(), format_utc);
-        writeln!(f, "timestamp  until {timestamp}")?;
-        for key in &status.keys {
-            let place = if key.is_here { "" } else { " (elsewhere)" };
-            writeln!(f, "{:<10} {}{place}", key.role, key.id)?;
-        }
-        Ok(())
+fn lines(status: &KeysStatus) -> Result<String, fmt::Error> {
+    let mut lines = String::new();
+    let expires = format_utc(status.root_expires_unix_secs);
+    writeln!(lines, "root       {} until {expires}", status.root_version)?;
+    writeln!(lines, "SHA-256    {}", status.root_sha256)?;
+    writeln!(lines, "threshold  {}", status.threshold)?;
+    let timestamp = status.timestamp_expires_unix_secs.map_or("not published yet".into(), format_utc);
+    writeln!(lines, "timestamp  until {timestamp}")?;
+    for key in &status.keys {
+        let place = if key.is_here { "" } else { " (elsewhere)" };
+        writeln!(lines, "{:<10} {}{place}", key.role, key.id)?;
     }
+    Ok(lines)
 }

@@ -47,16 +47,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn memory_has_a_least_size() {
-        assert_eq!(parse_memory("64MiB"), Ok(67_108_864));
-        assert_eq!(
-            parse_memory("67108863"),
-            Err("\"67108863\" is too little; expected at least 64MiB".into())
-        );
-        assert_eq!([parse_memory("2GB"), parse_memory("2G")], [Ok(2_000_000_000), Ok(2 << 30)]);
-    }
-
-    #[test]
     fn the_default_is_half_of_what_is_free() {
         let meminfo =
             "MemTotal:       24683964 kB\nMemFree: 1 kB\nMemAvailable:   20971520 kB\nBuffers: 5 kB\n";

@@ -12,7 +12,6 @@ mod fleet;
 mod keys;
 pub mod memory;
 mod next;
-mod outputs;
 pub mod progress;
 #[cfg(feature = "qdrant")]
 mod push;

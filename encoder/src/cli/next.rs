@@ -67,11 +67,12 @@ fn example(reader: &StoreReader) -> &'static str {
 
 pub(super) fn of_check(input: &InputArgs) -> String {
     let every = input.every.map_or(String::new(), |n| format!(" --every {n}"));
-    let activated = match input.activated {
-        Activated { scales: false, opacities: false } => "",
-        Activated { scales: true, opacities: false } => " --activated scales",
-        Activated { scales: false, opacities: true } => " --activated opacities",
-        Activated { scales: true, opacities: true } => " --activated scales,opacities",
+    let Activated { scales, opacities } = input.activated;
+    let activated = match (scales, opacities) {
+        (false, false) => "",
+        (true, false) => " --activated scales",
+        (false, true) => " --activated opacities",
+        (true, true) => " --activated scales,opacities",
     };
     format!("\nnext\n  slag-encoder encode{}{every}{activated} --store STORE\n", of_input(input))
 }

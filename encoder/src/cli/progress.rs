@@ -12,10 +12,11 @@ use crate::progress::{Progress, Silent};
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
 pub fn shown(is_shown: bool) -> Box<dyn Progress> {
-    if is_shown { Box::new(TerminalProgress::new()) } else { Box::new(Silent) }
+    let terminal = std::io::stderr().is_terminal();
+    if is_shown { Box::new(TerminalProgress { terminal, stage: Mutex::default() }) } else { Box::new(Silent) }
 }
 
-pub(crate) struct TerminalProgress {
+struct TerminalProgress {
     terminal: bool,
     stage: Mutex<Stage>,
 }
@@ -32,10 +33,6 @@ struct Stage {
 }
 
 impl TerminalProgress {
-    fn new() -> Self {
-        Self { terminal: std::io::stderr().is_terminal(), stage: Mutex::default() }
-    }
-
     fn stage(&self) -> std::sync::MutexGuard<'_, Stage> {
         self.stage.lock().unwrap_or_else(|e| e.into_inner())
     }

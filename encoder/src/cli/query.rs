@@ -12,8 +12,8 @@ use slag_common::splat::{self, ReadOptions, ply};
 use slag_common::{Gaussians, durable, files, npy};
 use slag_models::words_to_find;
 
+use super::common;
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
-use super::outputs;
 use crate::query::{self, Hit};
 use crate::store::StoreReader;
 use crate::view::{Found, Things};
@@ -59,7 +59,7 @@ pub struct QueryArgs {
 pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let outputs = args.scores.iter().chain(&args.ply).map(PathBuf::as_path);
     let read: Vec<&Path> = args.scene.iter().chain(&args.models.models).map(PathBuf::as_path).collect();
-    outputs::check(outputs, &read, Some(&args.store))?;
+    common::check(outputs, &read, Some(&args.store))?;
     args.scores.iter().chain(&args.ply).try_for_each(|path| files::check_writable(path))?;
     let reader = StoreReader::open(&args.store)?;
     let manifest = reader.manifest();
@@ -81,7 +81,14 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let lists = args.scores.is_none() || args.ply.is_some() || args.scene.is_some();
     let n_listed = if lists { args.limit as usize } else { 0 };
     let hits = query::located(&reader, &scores, &scores.best(n_listed))?;
-    let scene = args.scene.as_deref().map(|path| read_scene(path, &reader, &hits)).transpose()?;
+    let scene = match &args.scene {
+        Some(path) => {
+            let scene = splat::read(path, &ReadOptions { with_sh_rest: true })?;
+            query::check_scene(&reader, &scene, &hits).with_context(|| path.display().to_string())?;
+            Some(scene)
+        }
+        None => None,
+    };
     let matching = scores.matching(threshold);
     if let Some(path) = &args.ply {
         let located = query::located(&reader, &scores, &matching)?;
@@ -89,10 +96,7 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     }
     let n_matching = matching.len();
     let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
-    let things = match lists {
-        true => Things::open(&reader, |_| {})?,
-        false => Things::default(),
-    };
+    let things = if lists { Things::open(&reader, |_| {})? } else { Things::default() };
     let least = args.threshold.unwrap_or_else(|| things.threshold(manifest, false));
     let things = things.matching(&[vector], least, n_listed);
     let mut lines = asked_as.as_ref().map_or(String::new(), |asked| format!("{words}: asked as {asked}\n"));
@@ -123,12 +127,6 @@ fn of_thing(Found { score, record, photo, .. }: &Found) -> String {
 fn of_hit(hit: &Hit) -> String {
     let p = hit.position_in_world;
     format!("{:.3}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z)
-}
-
-fn read_scene(path: &Path, reader: &StoreReader, hits: &[Hit]) -> Result<Gaussians> {
-    let scene = splat::read(path, &ReadOptions { with_sh_rest: true })?;
-    query::check_scene(reader, &scene, hits).with_context(|| path.display().to_string())?;
-    Ok(scene)
 }
 
 /// Writes the matching Gaussians, from the splat if given. `located`: hits whose position a shard knows.

@@ -1,6 +1,6 @@
 //! `store`: what a store holds, whether it is whole, and what can go.
 
-use std::fmt;
+use std::fmt::{self, Write};
 use std::path::PathBuf;
 
 use anyhow::Result;
@@ -10,8 +10,8 @@ use slag_common::Hash32;
 use slag_common::byte_size::ByteSize;
 use slag_common::tuf::format_utc;
 
+use super::common;
 use super::common::{Exit, print, warn_of_expiry};
-use super::outputs;
 use crate::encode::{JobStatus, job_status};
 use crate::progress::Progress;
 use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, signing_unix_secs};
@@ -72,7 +72,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
                 job: None,
             };
             match CatalogueCopy::of(&at.store, &std::env::temp_dir())? {
-                Some(catalogue) => {
+                Some(CatalogueCopy { catalogue, .. }) => {
                     listed.history = catalogue.generations()?;
                     listed.job = job_status(catalogue.db())?;
                 }
@@ -85,12 +85,11 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
         }
         StoreCommand::Verify(at) => {
             let reader = StoreReader::open(&at.store)?;
-            let listing = reader.listing();
-            progress.begin("verify", "file", listing.n_files() as u64, 0);
-            let verified = listing.verify(|| progress.advance(1));
+            progress.begin("verify", "file", reader.listing().len() as u64, 0);
+            let verified = reader.verify(|| progress.advance(1));
             progress.end();
             warn_of_expiry(&at.store);
-            print(json, &verified, Lines(&verified))?;
+            print(json, &verified, lines(&verified)?)?;
             Ok(if verified.bad.is_empty() { Exit::Done } else { Exit::Failed })
         }
         StoreCommand::Gc(at) => {
@@ -102,7 +101,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             Ok(Exit::Done)
         }
         StoreCommand::Export { at, out } => {
-            outputs::check([out.as_path()], &[], Some(&at.store))?;
+            common::check([out.as_path()], &[], Some(&at.store))?;
             let exported = export(&at.store, out)?;
             let Exported { n_files, len_bytes, n_removed } = exported;
             let lines = format!("{n_files} objects written, {}; {n_removed} removed\n", ByteSize(len_bytes));
@@ -177,7 +176,7 @@ impl fmt::Display for Listed {
         if let (Some(first), n @ 3..) = (self.history.first(), self.history.len()) {
             writeln!(f, "{n} generations since generation {}", first.generation)?;
         }
-        if let Some(JobStatus { n_views, is_published, step }) = &self.job {
+        if let Some(JobStatus { n_views, is_published, step, .. }) = &self.job {
             let step = step.as_deref().unwrap_or("begin");
             match is_published {
                 true => writeln!(f, "contributions of {n_views} views are kept")?,
@@ -188,31 +187,25 @@ impl fmt::Display for Listed {
     }
 }
 
-struct Lines<'a>(&'a Verified);
-
-impl fmt::Display for Lines<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Verified { n_files, len_bytes, bad } = self.0;
-        for object in bad {
-            let path = object.path.display();
-            match &object.fault {
-                Fault::Missing => write!(f, "{path}: missing")?,
-                Fault::Damaged => write!(f, "{path}: damaged")?,
-                Fault::Unreadable(error) => write!(f, "{path}: {error}")?,
-                Fault::Refused(what) => write!(f, "{path}: robots refuse it: {what}")?,
-            }
-            match object.holds.is_empty() {
-                true => writeln!(f)?,
-                false => writeln!(f, " ({})", object.holds.join("; "))?,
-            }
+fn lines(verified: &Verified) -> Result<String, fmt::Error> {
+    let mut lines = String::new();
+    let Verified { n_files, len_bytes, bad } = verified;
+    for object in bad {
+        let path = object.path.display();
+        match &object.fault {
+            Fault::Missing => write!(lines, "{path}: missing")?,
+            Fault::Damaged => write!(lines, "{path}: damaged")?,
+            Fault::Unreadable(error) => write!(lines, "{path}: {error}")?,
+            Fault::Refused(what) => write!(lines, "{path}: robots refuse it: {what}")?,
         }
-        write!(f, "{n_files} files, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
-        // Faults of metadata carry their own remedy.
-        let has_objects = bad.iter().any(|file| file.hash.is_some());
-        writeln!(
-            f,
-            "{}",
-            if has_objects { "; another encode into this store writes objects anew" } else { "" }
-        )
+        match object.holds.is_empty() {
+            true => writeln!(lines)?,
+            false => writeln!(lines, " ({})", object.holds.join("; "))?,
+        }
     }
+    write!(lines, "{n_files} files, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
+    // Faults of metadata carry their own remedy.
+    let has_objects = bad.iter().any(|file| file.hash.is_some());
+    lines += if has_objects { "; another encode into this store writes objects anew\n" } else { "\n" };
+    Ok(lines)
 }

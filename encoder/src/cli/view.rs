@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Result, ensure};
 use clap::Args;
 use glam::Vec3;
 use slag_common::splat::{self, ReadOptions};
@@ -75,7 +75,10 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
     let viewer = Viewer::new(shown(args)?);
     // Fails here, not only in the page, if the store is missing or of another splat.
     viewer.check()?;
-    check_page()?;
+    ensure!(
+        slag_view::is_built(),
+        "this program was built without its page; run scripts/build-page.sh and build it again"
+    );
     let access = Access::new(&args.listen, AccessSettings::default())?;
     let viewer = serve::bounded(router(viewer), serve::Limits::default(), access);
     runtime()?.block_on(async {
@@ -89,15 +92,6 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
         serve::serve(viewer, args.listen.clone(), serve::Limits::default(), None, opened, stopped()).await
     })?;
     Ok(Exit::Done)
-}
-
-fn check_page() -> Result<()> {
-    match slag_view::is_built() {
-        true => Ok(()),
-        false => Err(anyhow!(
-            "this program was built without its page; run scripts/build-page.sh and build it again"
-        )),
-    }
 }
 
 fn shown(args: &ViewArgs) -> Result<Viewed> {

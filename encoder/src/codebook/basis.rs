@@ -69,7 +69,7 @@ impl TextBank {
 
 /// How far scores move: for a difference d of embeddings, the mean over texts of (q . d)^2 is |F' d|^2.
 pub struct ScoreMetric {
-    dim: usize,
+    pub dim: usize,
     /// `[dim][dim]`: the lower triangle of the Cholesky factor F of the texts' second moments.
     factor: Vec<f64>,
 }
@@ -91,10 +91,6 @@ impl ScoreMetric {
         // The isotropic share keeps every pivot well above the least.
         let factor = cholesky(moments, dim, SmallPivots::Raise(isotropic / 2.0));
         Self { dim, factor }
-    }
-
-    pub fn dim(&self) -> usize {
-        self.dim
     }
 
     /// Standard deviation of scores over some vectors, as root mean square over texts.

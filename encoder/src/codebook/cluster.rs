@@ -7,7 +7,6 @@ use slag_math::matrix::{Panels, Rows};
 
 /// Rounds of 2-means when a cluster is split; the halves hardly move after the third.
 const SPLIT_ROUNDS: usize = 3;
-const REFINE_ROUNDS: usize = 1;
 /// Up to this many clusters are all split: each is still far too large.
 const FEW_CLUSTERS: usize = 16;
 /// One in this many clusters is split at a time, the worst first: almost the order of splitting one by one, with work
@@ -74,16 +73,16 @@ impl Clusters {
 /// The result depends on the points alone, not on threads.
 pub fn clusters(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Clusters {
     let split = split(points, max_rms, max_clusters.max(1));
-    let mut codes = vec![0; points.len()];
-    for (number, cluster) in split.iter().enumerate() {
-        cluster.members.iter().for_each(|point| codes[*point as usize] = number as u32);
-    }
-    let mut centres: Vec<f32> = split.into_iter().flat_map(|cluster| cluster.centre).collect();
-    for _ in 0..REFINE_ROUNDS {
-        codes = nearest(points, &centres);
-        centres = recentre(points, &mut codes, centres.len() / points.width);
-    }
-    Clusters { codes, centres }
+    let centres: Vec<f32> = split.into_iter().flat_map(|cluster| cluster.centre).collect();
+    let mut codes = nearest(points, &centres);
+    let members = Members::new(&codes, centres.len() / points.width);
+    // Clusters that lost all points are left out.
+    let kept: Vec<usize> =
+        (0..members.starts.len() - 1).filter(|cluster| !members.places(*cluster).is_empty()).collect();
+    codes.iter_mut().for_each(|code| *code = kept.partition_point(|kept| *kept < *code as usize) as u32);
+    let centre = |cluster| mean(points, &members.order[members.places(cluster)]);
+    let centres: Vec<Vec<f32>> = kept.into_par_iter().map(centre).collect();
+    Clusters { codes, centres: centres.concat() }
 }
 
 pub fn nearest(points: Rows<'_>, centres: &[f32]) -> Vec<u32> {
@@ -94,25 +93,7 @@ pub fn nearest(points: Rows<'_>, centres: &[f32]) -> Vec<u32> {
     Panels::new(width, half_norms.len(), |i, c| centres[c * width + i]).largest(points, &half_norms)
 }
 
-/// Returns the means of the clusters with points, and renumbers these.
-fn recentre(points: Rows<'_>, codes: &mut [u32], n_clusters: usize) -> Vec<f32> {
-    let mut members = vec![Vec::new(); n_clusters];
-    codes.iter().enumerate().for_each(|(point, code)| members[*code as usize].push(point as u32));
-    let mut number = 0;
-    let numbers: Vec<u32> = members
-        .iter()
-        .map(|members| {
-            number += u32::from(!members.is_empty());
-            number.max(1) - 1
-        })
-        .collect();
-    codes.iter_mut().for_each(|code| *code = numbers[*code as usize]);
-    members.retain(|members| !members.is_empty());
-    let centres: Vec<Vec<f32>> = members.into_par_iter().map(|members| mean(points, &members)).collect();
-    centres.concat()
-}
-
-fn mean(points: Rows<'_>, members: &[u32]) -> Vec<f32> {
+pub(super) fn mean(points: Rows<'_>, members: &[u32]) -> Vec<f32> {
     let mut sum = vec![0.0f64; points.width];
     for point in members {
         sum.iter_mut().zip(points.get(*point as usize)).for_each(|(s, v)| *s += f64::from(*v));

@@ -8,8 +8,6 @@
 
 pub mod basis;
 pub mod cluster;
-mod compare;
-mod fine;
 pub mod measure;
 mod outliers;
 pub(crate) mod residual;
@@ -20,13 +18,12 @@ use slag_common::shard::{self, ScoreErrors};
 
 use basis::{Basis, MAX_COMPONENTS};
 use cluster::{Clusters, Members};
-use compare::{Decoder, Reference};
-use measure::ScoreMoments;
+use measure::{Decoder, Reference, ScoreMoments};
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 
 pub use basis::{ScoreMetric, TextBank};
-pub(crate) use fine::FineResiduals;
+pub(crate) use residual::FineResiduals;
 
 /// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled
 /// house, whose errors have heavy tails; 1.25 for normally distributed errors.
@@ -144,12 +141,12 @@ pub fn build(
     settings: &CodebookSettings,
 ) -> Codebook {
     let rms = |error: f32| error * RMS_OF_MEAN * score_context.spread;
-    let Clustered { mut basis, points, found } = Clustered::new(embeddings, score_context, settings);
+    let (mut basis, mut points, found) = clustered(embeddings, score_context, settings);
     let m = basis.n_components;
     let members = Members::new(&found.codes, found.centres.len() / m);
-    let scaled = ScaledResiduals::new(points, &found, &members, m);
-    let (code, turn) = scaled.plan(&found.codes, rms(settings.balanced_error), settings.max_subspaces);
-    let scales = scaled.scales;
+    let scales = scale_residuals(&mut points, &found, &members, m);
+    let (max_rms, max_subspaces) = (rms(settings.balanced_error), settings.max_subspaces);
+    let (code, turn) = plan_code(Rows::all(&points, m), &scales, &found.codes, max_rms, max_subspaces);
     basis.rotate(&turn);
     let centres = Panels::new(m, m, |old, new| turn[new * m + old]).product(Rows::all(&found.centres, m));
     let stored = StoredCentroids::new(&basis, &centres, &scales);
@@ -179,80 +176,70 @@ pub fn build(
     }
 }
 
-struct Clustered {
-    basis: Basis,
-    /// `[n][m]`.
-    points: Vec<f32>,
-    found: Clusters,
+/// Basis, the embeddings' components in it (`[n][m]`), and their clusters.
+fn clustered(
+    embeddings: Rows<'_>,
+    context: &ScoreMetricContext,
+    settings: &CodebookSettings,
+) -> (Basis, Vec<f32>, Clusters) {
+    let (n, dim) = (embeddings.len(), embeddings.width);
+    let rms = |error: f32| error * RMS_OF_MEAN * context.spread;
+    let tolerance = TAIL_SHARE * rms(settings.balanced_error);
+    let basis = Basis::fit(embeddings, &context.metric, tolerance, settings.max_components);
+    let m = basis.n_components;
+    let points = basis.components(embeddings);
+    let rows = Rows::all(&points, m);
+    let max_centroids = (n / settings.min_gaussians_per_centroid.max(1)).max(1);
+    let mut found = cluster::clusters(rows, rms(settings.compact_error), max_centroids);
+    if settings.outlier_bytes > 0.0 {
+        let n_more = settings.outlier_bytes * n as f32 / (m + BYTES_BESIDE_COMPONENTS) as f32;
+        let n_more = n_more as usize + dim / OUTLIERS_OF_DIM;
+        // A bound within the spread of scores tells them apart.
+        outliers::separate(embeddings, &basis, rows, &mut found, n_more, context.spread);
+    }
+    (basis, points, found)
 }
 
-impl Clustered {
-    fn new(embeddings: Rows<'_>, context: &ScoreMetricContext, settings: &CodebookSettings) -> Self {
-        let (n, dim) = (embeddings.len(), embeddings.width);
-        let rms = |error: f32| error * RMS_OF_MEAN * context.spread;
-        let tolerance = TAIL_SHARE * rms(settings.balanced_error);
-        let basis = Basis::fit(embeddings, &context.metric, tolerance, settings.max_components);
-        let m = basis.n_components;
-        let points = basis.components(embeddings);
-        let rows = Rows::all(&points, m);
-        let max_centroids = (n / settings.min_gaussians_per_centroid.max(1)).max(1);
-        let mut found = cluster::clusters(rows, rms(settings.compact_error), max_centroids);
-        if settings.outlier_bytes > 0.0 {
-            let n_more = settings.outlier_bytes * n as f32 / (m + BYTES_BESIDE_COMPONENTS) as f32;
-            let n_more = n_more as usize + dim / OUTLIERS_OF_DIM;
-            // A bound within the spread of scores tells them apart.
-            outliers::separate(embeddings, &basis, rows, &mut found, n_more, context.spread);
-        }
-        Self { basis, points, found }
-    }
+/// Subtracts from each point its centroid, and divides it by the RMS of the centroid's residuals; returns these, `[K]`.
+fn scale_residuals(points: &mut [f32], found: &Clusters, members: &Members, m: usize) -> Vec<f32> {
+    points.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(point, centroid)| {
+        let centre = &found.centres[*centroid as usize * m..][..m];
+        point.iter_mut().zip(centre).for_each(|(p, c)| *p -= c);
+    });
+    let in_order = Rows { values: &*points, width: m, index: Some(&members.order) };
+    let squares = |place: usize| in_order.get(place).iter().map(|v| f64::from(v * v)).sum::<f64>();
+    let scale = |centroid: usize| {
+        let places = members.places(centroid);
+        let n = places.len() as f64;
+        // At least 1e-6, against division by zero where members coincide.
+        ((places.map(squares).sum::<f64>() / n).sqrt() as f32).max(1e-6)
+    };
+    let scales: Vec<f32> = (0..members.starts.len() - 1).into_par_iter().map(scale).collect();
+    points.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(residual, centroid)| {
+        let scale = scales[*centroid as usize].recip();
+        residual.iter_mut().for_each(|v| *v *= scale);
+    });
+    scales
 }
 
-/// Points minus their centroids, each divided by its centroid's scale.
-struct ScaledResiduals {
-    m: usize,
-    /// `[n][m]`, by point.
-    residuals: Vec<f32>,
-    /// `[K]`: RMS of the residuals.
-    scales: Vec<f32>,
-}
-
-impl ScaledResiduals {
-    fn new(points: Vec<f32>, found: &Clusters, members: &Members, m: usize) -> Self {
-        let mut residuals = points;
-        residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(point, centroid)| {
-            let centre = &found.centres[*centroid as usize * m..][..m];
-            point.iter_mut().zip(centre).for_each(|(p, c)| *p -= c);
-        });
-        let in_order = Rows { values: &residuals, width: m, index: Some(&members.order) };
-        let squares = |place: usize| in_order.get(place).iter().map(|v| f64::from(v * v)).sum::<f64>();
-        let scale = |centroid: usize| {
-            let places = members.places(centroid);
-            let n = places.len() as f64;
-            // At least 1e-6, against division by zero where members coincide.
-            ((places.map(squares).sum::<f64>() / n).sqrt() as f32).max(1e-6)
-        };
-        let scales: Vec<f32> = (0..members.starts.len() - 1).into_par_iter().map(scale).collect();
-        residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(residual, centroid)| {
-            let scale = scales[*centroid as usize].recip();
-            residual.iter_mut().for_each(|v| *v *= scale);
-        });
-        Self { m, residuals, scales }
-    }
-
-    /// Residual code, if needed, and the rotation (rows `[m][m]`) to the residuals' eigenvectors in its order.
-    fn plan(&self, codes: &[u32], max_rms: f32, max_subspaces: usize) -> (Option<ResidualCode>, Vec<f32>) {
-        let m = self.m;
-        let residuals = Rows::all(&self.residuals, m);
-        let (turn, variances) = residual::rotation(residuals);
-        let turned = Panels::new(m, m, |old, new| turn[new * m + old]).product(residuals);
-        let scale_of: Vec<f32> = codes.iter().map(|centroid| self.scales[*centroid as usize]).collect();
-        let planned = residual::plan(Rows::all(&turned, m), &scale_of, &variances, max_rms, max_subspaces);
-        let (order, code) = match planned {
-            Some((order, code)) => (order, Some(code)),
-            None => ((0..m).collect(), None),
-        };
-        (code, order.iter().flat_map(|c| &turn[c * m..][..m]).copied().collect())
-    }
+/// Residual code, if needed, and the rotation (rows `[m][m]`) to the residuals' eigenvectors in its order.
+fn plan_code(
+    residuals: Rows<'_>,
+    scales: &[f32],
+    codes: &[u32],
+    max_rms: f32,
+    max_subspaces: usize,
+) -> (Option<ResidualCode>, Vec<f32>) {
+    let m = residuals.width;
+    let (turn, variances) = residual::rotation(residuals);
+    let turned = Panels::new(m, m, |old, new| turn[new * m + old]).product(residuals);
+    let scale_of: Vec<f32> = codes.iter().map(|centroid| scales[*centroid as usize]).collect();
+    let planned = residual::plan(Rows::all(&turned, m), &scale_of, &variances, max_rms, max_subspaces);
+    let (order, code) = match planned {
+        Some((order, code)) => (order, Some(code)),
+        None => ((0..m).collect(), None),
+    };
+    (code, order.iter().flat_map(|c| &turn[c * m..][..m]).copied().collect())
 }
 
 /// Centroids and basis in 8 bits; each component's range goes into its basis vector.
@@ -315,7 +302,7 @@ fn code_residuals(
     let (m, ranges, members) = (fitted.n_components, &stored.ranges, reference.members);
     let residuals = residuals_of_stored(reference, fitted, &scales);
     let fine = has_fine.then(|| {
-        let (fine, decoded) = fine::round(&residuals, m, &members.starts, &scales, ranges);
+        let (fine, decoded) = residual::round(&residuals, m, &members.starts, &scales, ranges);
         let (_, errors) = reference.compare(Some((&stored.decoder(m), &decoded)));
         FineResiduals { errors, ..fine }
     });

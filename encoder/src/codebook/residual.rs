@@ -6,11 +6,11 @@
 
 use half::f16;
 use rayon::prelude::*;
-use slag_common::shard::{BLOCK, CODEWORDS};
-
-use super::cluster::{clusters, nearest, squared_distance};
+use slag_common::shard::{BLOCK, CODEWORDS, ScoreErrors};
 use slag_math::eigen::eigen_symmetric;
 use slag_math::matrix::Rows;
+
+use super::cluster::{Members, clusters, mean, nearest, squared_distance};
 
 const TRAINING_SAMPLE: usize = 6144;
 /// Most components of a subspace: 16 codewords describe more too coarsely.
@@ -168,19 +168,13 @@ pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
     /// Rounds after those of the clusters: more gain less than a hundredth.
     const ROUNDS: usize = 4;
     let mut codewords = clusters(points, 0.0, n_codewords).centres;
+    let n_codewords = codewords.len() / points.width;
     for _ in 0..ROUNDS {
-        let codes = nearest(points, &codewords);
-        let mut sums = vec![0.0f64; codewords.len()];
-        let mut counts = vec![0.0f64; codewords.len() / points.width];
-        for (point, code) in codes.iter().enumerate() {
-            counts[*code as usize] += 1.0;
-            let sum = &mut sums[*code as usize * points.width..][..points.width];
-            sum.iter_mut().zip(points.get(point)).for_each(|(s, v)| *s += f64::from(*v));
-        }
-        for (at, codeword) in codewords.iter_mut().enumerate() {
-            let count = counts[at / points.width];
-            if count > 0.0 {
-                *codeword = (sums[at] / count) as f32;
+        let members = Members::new(&nearest(points, &codewords), n_codewords);
+        for (number, codeword) in codewords.chunks_exact_mut(points.width).enumerate() {
+            let places = members.places(number);
+            if !places.is_empty() {
+                codeword.copy_from_slice(&mean(points, &members.order[places]));
             }
         }
     }
@@ -260,4 +254,54 @@ fn loss(d: usize, log_product: f64) -> f64 {
 
 fn log_variance(variance: f64) -> f64 {
     variance.max(1e-30).ln()
+}
+
+pub struct FineResiduals {
+    /// `[m]`.
+    pub steps: Vec<f32>,
+    /// `[K]`.
+    pub scales: Vec<f32>,
+    /// `[n][m]`.
+    pub values: Vec<i8>,
+    pub errors: ScoreErrors,
+}
+
+/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits; returns them and their decoded form in
+/// readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
+pub(super) fn round(
+    residuals: &[f32],
+    m: usize,
+    centroid_starts: &[u32],
+    residual_scales: &[f32],
+    ranges: &[f32],
+) -> (FineResiduals, Vec<f32>) {
+    const MOST: f32 = 127.0;
+    let of_centroid =
+        |centroid: usize| centroid_starts[centroid] as usize * m..centroid_starts[centroid + 1] as usize * m;
+    let mut squares = vec![0.0f64; m];
+    for (centroid, scale) in residual_scales.iter().enumerate() {
+        for (at, v) in residuals[of_centroid(centroid)].iter().enumerate() {
+            squares[at % m] += f64::from(v * scale).powi(2);
+        }
+    }
+    let n = (residuals.len() / m).max(1) as f64;
+    // At least 1e-9, against division by zero where a component has no residuals.
+    let sizes: Vec<f32> = squares.iter().map(|s| ((s / n).sqrt() as f32).max(1e-9)).collect();
+    let steps: Vec<f32> = sizes.iter().zip(ranges).map(|(size, range)| size / range).collect();
+    let (mut scales, mut values) =
+        (Vec::with_capacity(residual_scales.len()), Vec::with_capacity(residuals.len()));
+    let mut decoded = Vec::with_capacity(residuals.len());
+    for (centroid, residual_scale) in residual_scales.iter().enumerate() {
+        let in_sizes = |(at, v): (usize, &f32)| v * residual_scale / sizes[at % m];
+        let members = || residuals[of_centroid(centroid)].iter().enumerate();
+        let scale = members().map(in_sizes).fold(0.0f32, |most, v| most.max(v.abs())) / MOST;
+        let factor = if scale > 0.0 { scale.recip() } else { 0.0 };
+        for (at, v) in members() {
+            let value = (in_sizes((at, v)) * factor).round().clamp(-MOST, MOST);
+            values.push(value as i8);
+            decoded.push(value * steps[at % m] * scale);
+        }
+        scales.push(scale);
+    }
+    (FineResiduals { steps, scales, values, errors: ScoreErrors::default() }, decoded)
 }

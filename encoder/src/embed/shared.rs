@@ -6,12 +6,14 @@
 //! in the way of the threads that feed the GPUs.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
+use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-use slag_models::{Crop, ImageEncoder, InferenceError, ModelError};
+use slag_models::{Crop, ImageEncoder, ModelError};
 
-use super::EmbedError;
+use super::{EmbedError, embed_crops};
 use crate::lanes::{GpuLoad, Lane, Lanes};
 use crate::memory::{MemoryPlan, Phase};
 
@@ -42,26 +44,26 @@ struct Shared {
 #[derive(Default)]
 struct Queue {
     waiting: VecDeque<Waiting>,
-    requests: BTreeMap<u64, Request>,
-    next_request: u64,
-    /// Whether a batch panicked and lost its crops.
-    is_abandoned: bool,
+    n_requests: u64,
+    /// By the end, or by a batch that panicked and lost its crops.
     is_closed: bool,
 }
 
 struct Waiting {
     crop: Crop,
+    place: Place,
+}
+
+/// Where a crop's vector goes.
+struct Place {
     request: u64,
     /// Index among the request's crops.
     at: usize,
+    answers: Sender<Answer>,
 }
 
-struct Request {
-    vectors: Vec<Vec<f32>>,
-    n_left: usize,
-    error: Option<Failure>,
-    is_done: Arc<Condvar>,
-}
+/// Vectors of consecutive crops, one after the other.
+type Answer = Result<(Range<usize>, Vec<f32>), Failure>;
 
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Failure {
@@ -114,37 +116,34 @@ impl SharedEncoders {
     /// # Errors
     /// [`Failure`]; crops of other views are not affected.
     pub fn embed(&self, crops: Vec<Crop>) -> Result<Vec<f32>, Failure> {
-        if crops.is_empty() {
-            return Ok(Vec::new());
-        }
-        let is_done = Arc::new(Condvar::new());
-        let (vectors, n_left) = (vec![Vec::new(); crops.len()], crops.len());
-        let request = Request { vectors, n_left, error: None, is_done: Arc::clone(&is_done) };
+        let mut n_left = crops.len();
+        let (answers, answered) = channel();
         let mut queue = self.shared.queue();
-        let own = queue.next_request;
-        queue.next_request += 1;
-        queue.requests.insert(own, request);
-        let waiting = |(at, crop)| Waiting { crop, request: own, at };
+        // The thread that panicked has printed the message.
+        assert!(!queue.is_closed, "a batch of crops was lost");
+        queue.n_requests += 1;
+        let request = queue.n_requests;
+        let waiting = |(at, crop)| Waiting { crop, place: Place { request, at, answers: answers.clone() } };
         queue.waiting.extend(crops.into_iter().enumerate().map(waiting));
-        self.shared.has_work.notify_one();
-        while queue.requests.get(&own).is_some_and(|request| request.n_left > 0) {
-            // The thread that panicked has printed the message.
-            assert!(!queue.is_abandoned, "a batch of crops was lost");
-            queue = is_done.wait(queue).unwrap_or_else(PoisonError::into_inner);
-        }
-        let done = queue.requests.remove(&own);
         drop(queue);
-        match done {
-            Some(Request { error: Some(error), .. }) => Err(error),
-            done => Ok(done.map(|request| request.vectors.concat()).unwrap_or_default()),
+        drop(answers);
+        self.shared.has_work.notify_one();
+        let mut parts = BTreeMap::new();
+        while n_left > 0 {
+            let answer = answered.recv().expect("a batch of crops was lost");
+            let (crops, vectors) = answer.inspect_err(|_| {
+                self.shared.queue().waiting.retain(|waiting| waiting.place.request != request);
+            })?;
+            n_left -= crops.len();
+            parts.insert(crops.start, vectors);
         }
+        Ok(parts.into_values().flatten().collect())
     }
 }
 
 impl Drop for SharedEncoders {
     fn drop(&mut self) {
-        self.shared.queue().is_closed = true;
-        self.shared.has_work.notify_all();
+        self.shared.close();
         // A panic has left its message, and views that waited for the batch have panicked.
         self.threads.drain(..).for_each(|thread| drop(thread.join()));
     }
@@ -155,8 +154,16 @@ impl Shared {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Ends the lanes' threads; views that still wait get no answer.
+    fn close(&self) {
+        let mut queue = self.queue();
+        queue.is_closed = true;
+        queue.waiting.clear();
+        self.has_work.notify_all();
+    }
+
     fn work(&self) {
-        let guard = AbandonOnPanic(self);
+        let _guard = CloseAtEnd(self);
         let mut queue = self.queue();
         while !queue.is_closed {
             if queue.waiting.is_empty() {
@@ -164,12 +171,9 @@ impl Shared {
                 continue;
             }
             drop(queue);
-            let done = self.run_batch(&mut self.lanes.take());
+            self.run_batch(&mut self.lanes.take());
             queue = self.queue();
-            queue.keep(done);
         }
-        drop(queue);
-        std::mem::forget(guard);
     }
 
     fn opened<'l>(
@@ -182,88 +186,57 @@ impl Shared {
         Ok(lane.as_mut().expect("opened").as_mut())
     }
 
-    fn run_batch(&self, lane: &mut Lane<'_, Option<Box<dyn ImageEncoder>>>) -> Vec<Done> {
+    /// Answers are sent view by view. A view that has failed does not receive any more.
+    fn run_batch(&self, lane: &mut Lane<'_, Option<Box<dyn ImageEncoder>>>) {
         let encoder = match self.opened(lane) {
             Ok(encoder) => encoder,
             // The encoder cannot be opened: the first crop gets the error, and the others will, too.
             Err(error) => {
-                let Some(Waiting { request, at, .. }) = self.queue().waiting.pop_front() else {
-                    return Vec::new();
-                };
-                return vec![Done { request, at, result: Err(error.into()) }];
+                if let Some(first) = self.queue().waiting.pop_front() {
+                    drop(first.place.answers.send(Err(error.into())));
+                }
+                return;
             }
         };
-        let batch: Vec<Waiting> = {
+        let (crops, places): (Vec<Crop>, Vec<Place>) = {
             let mut queue = self.queue();
             let n = queue.waiting.len().min(encoder.preferred_batch());
-            let batch = queue.waiting.drain(..n).collect();
+            let batch = queue.waiting.drain(..n).map(|waiting| (waiting.crop, waiting.place)).unzip();
             if !queue.waiting.is_empty() {
                 self.has_work.notify_one();
             }
             batch
         };
-        if batch.is_empty() {
-            return Vec::new();
+        if crops.is_empty() {
+            return;
         }
         let dim = encoder.dim();
-        let (crops, places): (Vec<Crop>, Vec<(u64, usize)>) =
-            batch.into_iter().map(|waiting| (waiting.crop, (waiting.request, waiting.at))).unzip();
-        if let Ok(vectors) = encoder.encode(&crops) {
-            let done = |((request, at), vector): ((u64, usize), &[f32])| Done {
-                request,
-                at,
-                result: Ok(vector.to_vec()),
+        let together = encoder.encode(&crops);
+        let mut done = 0;
+        for places in places.chunk_by(|a, b| a.request == b.request) {
+            let (first, of_view) = (places[0].at, done..done + places.len());
+            done = of_view.end;
+            let vectors = match &together {
+                Ok(vectors) => Ok(vectors[of_view.start * dim..of_view.end * dim].to_vec()),
+                // One by one, so that only the bad crop's view fails.
+                Err(_) => {
+                    let crops = crops[of_view].chunks(1).zip(first..);
+                    let alone = crops.map(|(crop, at)| embed_crops(crop, at, encoder));
+                    alone.collect::<Result<Vec<_>, _>>().map(|vectors| vectors.concat())
+                }
             };
-            return places.into_iter().zip(vectors.chunks_exact(dim)).map(done).collect();
+            let answer = vectors.map(|vectors| (first..first + places.len(), vectors));
+            drop(places[0].answers.send(answer.map_err(Failure::from)));
         }
-        // One by one, so that only the bad crop's view fails.
-        let alone = |((request, at), crop): ((u64, usize), &Crop)| {
-            let result = encoder.encode(std::slice::from_ref(crop));
-            let failed = |cause: InferenceError| {
-                Failure::Embed(EmbedError::Encode { first: at, last: at, cause: Box::new(cause) })
-            };
-            Done { request, at, result: result.map_err(failed) }
-        };
-        places.into_iter().zip(&crops).map(alone).collect()
     }
 }
 
-/// Dropped only by a panic; tells the waiting views.
-struct AbandonOnPanic<'l>(&'l Shared);
+/// Closes the queue when a lane's thread ends, also by a panic, so that no view waits for it.
+struct CloseAtEnd<'l>(&'l Shared);
 
-impl Drop for AbandonOnPanic<'_> {
+impl Drop for CloseAtEnd<'_> {
     fn drop(&mut self) {
-        let mut queue = self.0.queue();
-        queue.is_abandoned = true;
-        queue.requests.values().for_each(|request| request.is_done.notify_one());
-    }
-}
-
-struct Done {
-    request: u64,
-    at: usize,
-    result: Result<Vec<f32>, Failure>,
-}
-
-impl Queue {
-    fn keep(&mut self, done: Vec<Done>) {
-        for Done { request: number, at, result } in done {
-            let Some(request) = self.requests.get_mut(&number) else { continue };
-            match result {
-                Ok(vector) => {
-                    request.vectors[at] = vector;
-                    request.n_left = request.n_left.saturating_sub(1);
-                }
-                Err(error) => {
-                    request.error = Some(error);
-                    request.n_left = 0;
-                    self.waiting.retain(|waiting| waiting.request != number);
-                }
-            }
-            if request.n_left == 0 {
-                request.is_done.notify_one();
-            }
-        }
+        self.0.close();
     }
 }
 
@@ -309,7 +282,7 @@ mod tests {
                 }
             });
             assert!((1..=gpus.len() * n_lanes).contains(&n_opened.load(Ordering::SeqCst)));
-            assert!(shared.shared.queue().requests.is_empty() && shared.shared.queue().waiting.is_empty());
+            assert!(shared.shared.queue().waiting.is_empty());
         }
     }
 

@@ -27,9 +27,6 @@ impl<'a> Engines<'a> {
     }
 }
 
-#[derive(Default)]
-struct StageTimes(Mutex<BTreeMap<&'static str, f64>>);
-
 struct Began {
     phase: Phase,
     at: Instant,
@@ -41,7 +38,8 @@ pub(crate) struct RunContext<'a> {
     pub(super) start: Instant,
     pub(crate) progress: &'a dyn Progress,
     pub(crate) cancel: &'a AtomicBool,
-    times: StageTimes,
+    /// Seconds by stage, added over threads.
+    times: Mutex<BTreeMap<&'static str, f64>>,
     phases: Mutex<Vec<Began>>,
     pub(crate) workers: Workers,
 }
@@ -53,10 +51,10 @@ impl<'a> RunContext<'a> {
         cancel: &'a AtomicBool,
     ) -> Result<Self, EncodeError> {
         let start = Instant::now();
-        let workers =
-            Workers::start(n_threads).map_err(|source| EncodeError::Threads { n_threads, source })?;
+        let failed = |error| format!("cannot start {n_threads} threads: {error}; use fewer with --threads");
+        let workers = Workers::start(n_threads).map_err(|error| EncodeError::Failed(failed(error)))?;
         let phases = Mutex::new(vec![Began { phase: Phase::Read, at: start, peak_before: None }]);
-        Ok(Self { start, progress, cancel, times: StageTimes::default(), phases, workers })
+        Ok(Self { start, progress, cancel, times: Mutex::default(), phases, workers })
     }
 
     pub(super) fn begin_phase(&self, phase: Phase) {
@@ -92,12 +90,12 @@ impl<'a> RunContext<'a> {
         let start = Instant::now();
         let result = work();
         let secs = start.elapsed().as_secs_f64();
-        *self.times.0.lock().unwrap_or_else(PoisonError::into_inner).entry(stage).or_default() += secs;
+        *self.times.lock().unwrap_or_else(PoisonError::into_inner).entry(stage).or_default() += secs;
         result
     }
 
     pub(crate) fn busy_secs(&self) -> BTreeMap<String, f64> {
-        let times = self.times.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let times = self.times.lock().unwrap_or_else(PoisonError::into_inner);
         times.iter().map(|(stage, secs)| ((*stage).to_owned(), *secs)).collect()
     }
 }

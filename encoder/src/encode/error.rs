@@ -20,14 +20,8 @@ use crate::viewpoints::{DrawError, ViewpointError};
 pub enum EncodeError {
     #[error("{setting}: {problem}")]
     Setting { setting: String, problem: String },
-    #[error(
-        "{model} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out"
-    )]
-    NoPatches { model: String },
     #[error("--text-model: {0}")]
     TextModel(#[from] TextSideError),
-    #[error("cannot start {n_threads} threads: {source}; use fewer with --threads")]
-    Threads { n_threads: usize, source: rayon::ThreadPoolBuildError },
     #[error(transparent)]
     Splat(#[from] SplatError),
     #[error(transparent)]
@@ -56,8 +50,6 @@ pub enum EncodeError {
     Store(#[from] StoreError),
     #[error(transparent)]
     Contributions(#[from] ContributionError),
-    #[error("view {view}: {}: {what}; run the same encode again: this view is made again, the others are kept", path.display())]
-    KeptView { view: String, path: PathBuf, what: String },
     #[error("{0}; {help}", help = io_help(.0))]
     Io(#[from] std::io::Error),
     #[error("job records: {0}; {help}", help = records_help(.0, "start over with --restart"))]
@@ -67,30 +59,13 @@ pub enum EncodeError {
          splat and settings, or drop it with --restart", path.display()
     )]
     OtherJob { path: PathBuf, n_done: usize },
-    #[error("{n_missing} of {n_views} photos are missing, the first is {}; give their folder with --images", first.display())]
-    MissingImages { n_missing: usize, n_views: usize, first: PathBuf },
-    #[error("{}: view {view} has a pose already in {}; give the photos other names, or leave one of the files out", path.display(), first.display())]
-    AddedTwice { view: String, first: PathBuf, path: PathBuf },
-    #[error("{}: applied_transform or applied_scale differ from those of {}; bring both poses into one frame", path.display(), first.display())]
-    AddedFrame { first: PathBuf, path: PathBuf },
-    #[error("--drop {view}: no poses file has this view; its first view is {first:?}")]
-    NoViewToDrop { view: String, first: String },
-    #[error("none of {n_views} views can be used; the first: {reason}")]
-    NoViews { n_views: usize, reason: String },
-    #[error(
-        "no Gaussian has an embedding, so nothing is published: {n_views} views ({n_views_without_masks} without masks) have \
-         {n_masks} masks and {n_entries} contributions; see whether masks, poses and splat fit with `slag-encoder check`, or \
-         publish it all the same with --allow-empty"
-    )]
-    NoEvidence { n_views: usize, n_views_without_masks: usize, n_masks: usize, n_entries: u64 },
-    #[error("{}: hardly any of {n_gaussians} Gaussians can be seen (finite, positive scales, a rotation, not transparent); export the splat again", path.display())]
-    NoGaussians { path: PathBuf, n_gaussians: usize },
-    #[error("view {view} has no pose: {reason}; remove it from the poses, or leave out --strict")]
-    NoPose { view: String, reason: String },
     #[error(
         "view {view}: its photo or masks changed after the encode began; leave the files alone, and encode again"
     )]
     Changed { view: String },
+    /// A message that says what to do.
+    #[error("{0}")]
+    Failed(String),
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
@@ -100,6 +75,10 @@ pub enum EncodeError {
 }
 
 impl EncodeError {
+    pub(super) fn no_views(n_views: usize, reason: &str) -> Self {
+        Self::Failed(format!("none of {n_views} views can be used; the first: {reason}"))
+    }
+
     /// Returns whether one view's input is at fault, so that the other views may go on.
     pub(crate) fn is_of_one_view(&self) -> bool {
         match self {
@@ -126,7 +105,10 @@ mod tests {
         let path = PathBuf::new();
         let many = ContributionError::TooManyRegions { path: path.clone(), found: usize::MAX };
         assert!(EncodeError::from(many).is_of_one_view());
-        assert!(EncodeError::from(SegmentError::NotFinite { view: "a".into() }).is_of_one_view());
+        assert!(
+            EncodeError::from(SegmentError::View { view: "a".into(), problem: "many".into() })
+                .is_of_one_view()
+        );
         let of = |cause: InferenceError| {
             let source = EmbedError::Encode { first: 3, last: 3, cause: Box::new(cause) };
             EncodeError::Embed { view: "a".into(), source }.is_of_one_view()

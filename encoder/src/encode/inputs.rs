@@ -1,21 +1,27 @@
 //! Scene, views and geo-reference as they were read.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::path::Path;
 use std::sync::Arc;
 
+use rayon::prelude::*;
+use serde::Serialize;
+use serde_json::{Value, json};
 use slag_common::frames::GeoReference;
-use slag_common::poses::ViewSet;
+use slag_common::poses::{self, ViewSet};
 use slag_common::splat::{self, ReadOptions};
-use slag_common::{Gaussians, View, poses};
+use slag_common::{Gaussians, Hash32, Intrinsics, View};
 
-use super::context::RunContext;
+use super::context::{Engines, RunContext};
 use super::error::EncodeError;
 use super::report::SkippedView;
-use super::settings::{EncodeSettings, InputSettings};
+use super::settings::{EncodeSettings, InputSettings, MAX_RASTER_WIDTH_PX, ViewSettings};
 use crate::cells::{self, CellSplit, PositionError};
 use crate::ground::Standing;
 use crate::memory::{MemoryPlan, Phase};
+use crate::segment::Segmenter;
+use crate::store::remove_files;
+use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
 use crate::{check, ingest};
 
 /// A splat is damaged if fewer than one in this many Gaussians can be seen.
@@ -57,7 +63,9 @@ impl Inputs {
         }
         let (views, mut missing) = find_views(settings, set.views)?;
         if let (true, Some((view, reason))) = (settings.run.strict, damaged.first()) {
-            return Err(EncodeError::NoPose { view: view.clone(), reason: reason.clone() });
+            return Err(EncodeError::Failed(format!(
+                "view {view} has no pose: {reason}; remove it from the poses, or leave out --strict"
+            )));
         }
         missing.extend(damaged.into_iter().map(|(view, reason)| SkippedView { view, reason }));
         context.install(|| check::suspicions(&scene, &views)).iter().for_each(|suspicion| {
@@ -70,7 +78,12 @@ impl Inputs {
         let n_visible =
             (0..scene.len()).filter(|i| scene.is_usable(*i) && scene.opacities[*i] >= 1.0 / 255.0).count();
         if split.cells.is_empty() || n_visible * MIN_VISIBLE_ONE_IN < scene.len() {
-            return Err(EncodeError::NoGaussians { path: inputs.scene.clone(), n_gaussians: scene.len() });
+            return Err(EncodeError::Failed(format!(
+                "{}: hardly any of {} Gaussians can be seen (finite, positive scales, a rotation, not transparent); export the \
+                 splat again",
+                inputs.scene.display(),
+                scene.len()
+            )));
         }
         if split.n_for_precision > cells::MAX_CELLS_FOR_PRECISION {
             let (n, most) = (split.n_for_precision, cells::MAX_CELLS_FOR_PRECISION);
@@ -170,13 +183,18 @@ fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
 /// Adds the views of another poses file; returns the number of drawings. `first`: the first file, for errors.
 fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, EncodeError> {
     let added = poses::read(path, None)?;
+    let (shown, first) = (path.display(), first.display());
     if added.applied != set.applied {
-        return Err(EncodeError::AddedFrame { first: first.to_owned(), path: path.to_owned() });
+        return Err(EncodeError::Failed(format!(
+            "{shown}: applied_transform or applied_scale differ from those of {first}; bring both poses into one frame"
+        )));
     }
     let known: HashSet<&str> = set.views.iter().map(|view| view.name.as_str()).collect();
     if let Some(view) = added.views.iter().find(|view| known.contains(view.name.as_str())) {
-        let view = view.name.clone();
-        return Err(EncodeError::AddedTwice { view, first: first.to_owned(), path: path.to_owned() });
+        return Err(EncodeError::Failed(format!(
+            "{shown}: view {} has a pose already in {first}; give the photos other names, or leave one of the files out",
+            view.name
+        )));
     }
     let n_drawn = ingest::drawn_from(path).map_or(0, |_| added.views.len());
     set.views.extend(added.views);
@@ -190,8 +208,10 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, Enco
 fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError> {
     for name in names {
         let Some(at) = views.iter().position(|view| view.name == *name) else {
-            let first = views.first().map(|view| view.name.clone()).unwrap_or_default();
-            return Err(EncodeError::NoViewToDrop { view: name.clone(), first });
+            let first = views.first().map_or("", |view| &view.name);
+            return Err(EncodeError::Failed(format!(
+                "--drop {name}: no poses file has this view; its first view is {first:?}"
+            )));
         };
         views.remove(at);
     }
@@ -203,33 +223,219 @@ fn find_views(
     views: Vec<View>,
 ) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
     let n_views = views.len();
-    let missing: HashSet<String> =
-        ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
-    let (gone, found): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| missing.contains(&v.name));
+    let (found, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| v.image_path.is_file());
     if let (true, Some(first)) = (settings.run.strict, gone.first()) {
-        let first = first.image_path.clone();
-        return Err(EncodeError::MissingImages { n_missing: gone.len(), n_views, first });
+        return Err(EncodeError::Failed(format!(
+            "{} of {n_views} photos are missing, the first is {}; give their folder with --images",
+            gone.len(),
+            first.image_path.display()
+        )));
     }
-    let skipped: Vec<SkippedView> = gone
-        .into_iter()
-        .map(|v| SkippedView {
-            reason: format!(
-                "{}: no such photo; give the photos' folder with --images",
-                v.image_path.display()
-            ),
-            view: v.name,
-        })
-        .collect();
+    let skip = |View { name: view, image_path, .. }: View| {
+        let reason =
+            format!("{}: no such photo; give the photos' folder with --images", image_path.display());
+        SkippedView { view, reason }
+    };
+    let skipped: Vec<SkippedView> = gone.into_iter().map(skip).collect();
     if found.is_empty() {
         let reason = skipped.first().map_or("the poses file has none".into(), |s| s.reason.clone());
-        return Err(EncodeError::NoViews { n_views, reason });
+        return Err(EncodeError::no_views(n_views, &reason));
     }
     Ok((found, skipped))
 }
 
+/// Version of plan and drawings; a change redraws them.
+const PLAN_VERSION: u32 = 4;
+
+/// Draws a splat's planned views beside the poses file, unless they are there.
+pub(super) fn make(
+    settings: &EncodeSettings,
+    planned: &ViewpointSettings,
+    engines: &Engines<'_>,
+    context: &RunContext<'_>,
+) -> Result<(), EncodeError> {
+    let inputs = &settings.inputs;
+    let mut scene =
+        context.time("read", || splat::read(&inputs.scene, &ReadOptions { with_sh_rest: true }))?;
+    inputs.activated.undo(&mut scene);
+    let device = engines.rasterizer.identity();
+    let id = context.install(|| identity(&scene, planned, &device))?;
+    let folder = inputs.views.parent().unwrap_or(Path::new("."));
+    if is_there(&inputs.views, id) {
+        return Ok(());
+    }
+    viewpoints::check_folder(folder)?;
+    let make = || {
+        let memory_bytes = settings.run.memory_bytes;
+        viewpoints::plan(&scene, engines.rasterizer, planned, memory_bytes, context.cancel)
+    };
+    let plan = context.time("plan views", || context.install(make));
+    let plan = plan.map_err(|error| match error {
+        ViewpointError::Interrupted => EncodeError::Interrupted { n_done: 0, n_views: planned.n_views },
+        other => other.into(),
+    })?;
+    tracing::info!("no photos: {plan}");
+    // Drawings of another plan.
+    remove_files(&folder.join("images"), |name| name.starts_with("drawn-"))?;
+    let name = inputs.scene.file_name().unwrap_or_default().to_string_lossy();
+    let (views, about) = (viewpoints::views_of(&plan), json!({ "plan": id.to_string() }));
+    let (rasterizer, progress) = (engines.rasterizer, context.progress);
+    let draw = || viewpoints::draw_sharpened(folder, &views, &mut scene, rasterizer, &name, about, progress);
+    context.time("draw", || context.install(draw))?;
+    Ok(())
+}
+
+fn identity(scene: &Gaussians, planned: &ViewpointSettings, device: &str) -> Result<Hash32, EncodeError> {
+    let columns: [&[u8]; 6] = [
+        bytemuck::cast_slice(&scene.means_in_world),
+        bytemuck::cast_slice(&scene.rotations_wxyz),
+        bytemuck::cast_slice(&scene.scales),
+        bytemuck::cast_slice(&scene.opacities),
+        bytemuck::cast_slice(&scene.sh_dc),
+        bytemuck::cast_slice(&scene.sh_rest),
+    ];
+    let columns = columns.map(|column| Hash32::of(column).to_string());
+    hash_of(&(PLAN_VERSION, env!("CARGO_PKG_VERSION"), device, planned, scene.sh_degree, columns))
+}
+
+/// Whether a poses file, which is written last, belongs to this plan.
+fn is_there(poses: &Path, id: Hash32) -> bool {
+    let text = fs_err::read(poses).ok();
+    let found = text.and_then(|text| serde_json::from_slice::<Value>(&text).ok());
+    found.is_some_and(|found| found["plan"] == id.to_string())
+}
+
+/// Version of the steps from masks to contributions; a change makes another encode.
+const REGIONS_VERSION: u32 = 4;
+
+/// Stands for a fleet's rasterisers, which differ between machines.
+#[cfg(feature = "fleet")]
+pub(crate) const OF_A_FLEET: &str = "fleet";
+
+/// Everything on which the contributions of all views depend: files by their content, settings as they are.
+///
+/// A setting is part of it by being a field of [`ViewSettings`].
+#[derive(Serialize)]
+struct SceneIdentity<'a> {
+    program: &'static str,
+    regions: (u32, u32),
+    encoder: Hash32,
+    /// Windows are no part of the encoder's id: they change no vector of a crop.
+    windows: &'a [u8],
+    session: Session,
+    segmenter: String,
+    /// Devices round differently; a fleet has many.
+    rasterizer: &'a str,
+    scene: Hash32,
+    settings: &'a ViewSettings,
+    cells: CellsIdentity,
+}
+
+/// See [`CellSplit::deciding`](crate::cells::CellSplit::deciding).
+type CellsIdentity = (usize, Option<f64>, Option<PositionError>);
+
+/// How models run: other hardware and another split of the work change vectors in the last bits.
+#[derive(Serialize)]
+struct Session {
+    providers: Vec<String>,
+    n_threads: usize,
+}
+
+#[derive(Serialize)]
+struct ViewIdentity<'a> {
+    of_scene: Hash32,
+    name: &'a str,
+    /// Hash of the photo's file; absent where it cannot be read.
+    photo: Option<Hash32>,
+    /// Hash of its mask file; absent where it has none.
+    masks: Option<Hash32>,
+    intrinsics: Intrinsics,
+    camera_from_world: glam::DAffine3,
+}
+
+/// Identities of the scene and, by name, of its views. A view's includes the scene's, but no other view, so photos can
+/// be added and withdrawn.
+pub(super) fn identities(
+    settings: &EncodeSettings,
+    engines: &Engines<'_>,
+    segmenter: &dyn Segmenter,
+    rasterizer: &str,
+    inputs: &Inputs,
+) -> Result<(Hash32, BTreeMap<String, Hash32>), EncodeError> {
+    let cells = inputs.split.deciding(settings.cells.limits);
+    let of_scene = of_scene(&settings.view, cells, engines, segmenter, rasterizer, &inputs.scene)?;
+    let of_view = |view: &View| Ok((view.name.clone(), of_view(of_scene, view, segmenter)?));
+    Ok((of_scene, inputs.views.par_iter().map(of_view).collect::<Result<_, EncodeError>>()?))
+}
+
+/// Hash of everything that a view's contributions depend on, from its files as they are now.
+pub(super) fn of_view(
+    of_scene: Hash32,
+    view: &View,
+    segmenter: &dyn Segmenter,
+) -> Result<Hash32, EncodeError> {
+    hash_of(&ViewIdentity {
+        of_scene,
+        name: &view.name,
+        photo: ingest::hash_file(&view.image_path).ok(),
+        masks: segmenter.identity_of_view(view)?,
+        intrinsics: view.intrinsics,
+        camera_from_world: view.camera_from_world,
+    })
+}
+
+/// Hash of everything that all views' contributions depend on.
+pub(crate) fn of_scene(
+    settings: &ViewSettings,
+    cells: CellsIdentity,
+    engines: &Engines<'_>,
+    segmenter: &dyn Segmenter,
+    rasterizer: &str,
+    scene: &Gaussians,
+) -> Result<Hash32, EncodeError> {
+    let Engines { models, session, .. } = engines;
+    hash_of(&SceneIdentity {
+        program: env!("CARGO_PKG_VERSION"),
+        regions: (REGIONS_VERSION, MAX_RASTER_WIDTH_PX),
+        encoder: Hash32(models.encoder_id().hash()),
+        windows: models.windows(),
+        session: Session {
+            providers: session.providers.iter().map(ToString::to_string).collect(),
+            n_threads: session.intra_op_threads,
+        },
+        segmenter: segmenter.identity(),
+        rasterizer,
+        scene: hash_scene(scene),
+        settings,
+        cells,
+    })
+}
+
+fn hash_of(identity: &impl Serialize) -> Result<Hash32, EncodeError> {
+    Ok(Hash32::of(&serde_json::to_vec(identity).map_err(std::io::Error::from)?))
+}
+
+fn hash_scene(scene: &Gaussians) -> Hash32 {
+    let columns: [&[u8]; 4] = [
+        bytemuck::cast_slice(&scene.means_in_world),
+        bytemuck::cast_slice(&scene.rotations_wxyz),
+        bytemuck::cast_slice(&scene.scales),
+        bytemuck::cast_slice(&scene.opacities),
+    ];
+    Hash32::of(&columns.map(|column| Hash32::of(column).0).concat())
+}
+
 #[cfg(test)]
 mod tests {
+    use std::path::{Path, PathBuf};
+
+    use slag_models::{ModelDir, Provider, SessionOptions};
+
     use super::*;
+    use crate::cells::CellSplit;
+    use crate::encode::Masks;
+    use crate::raster::{CpuRasterizer, pinhole};
+    use crate::segment::{GivenMasks, GraphSegmenter};
 
     #[test]
     fn a_scene_of_too_many_cells_is_refused() {
@@ -256,5 +462,97 @@ mod tests {
         reserve_photos(&mut memory, &["a.png", "b.png", "c.png"].map(view), 2, 4);
         let refused = memory.rest(0).expect_err("nothing fits");
         assert_eq!(refused.needed_bytes, 19 * (400 * 300 + 40 * 30) + 12 * 40 * 30);
+    }
+
+    fn inputs(photo: &Path) -> Inputs {
+        let view = View {
+            name: "a.png".into(),
+            image_path: photo.to_owned(),
+            intrinsics: pinhole([8, 8], 8.0),
+            camera_from_world: glam::DAffine3::IDENTITY,
+        };
+        Inputs {
+            scene: Gaussians::default(),
+            split: CellSplit::default(),
+            standing: std::sync::Arc::default(),
+            views: vec![view],
+            missing: Vec::new(),
+            geo_reference: None,
+            n_drawn: 0,
+        }
+    }
+
+    fn identity_with(
+        change: impl FnOnce(&mut EncodeSettings, &mut SessionOptions),
+        segmenter: &dyn Segmenter,
+        photo: &Path,
+    ) -> Hash32 {
+        let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        settings.view.masks = Masks::Graph;
+        let mut session = SessionOptions::new(PathBuf::new());
+        change(&mut settings, &mut session);
+        let models = ModelDir::colours();
+        let engines = Engines::new(&models, &session, &CpuRasterizer);
+        identities(&settings, &engines, segmenter, "cpu", &inputs(photo)).expect("readable").1["a.png"]
+    }
+
+    /// Views of two devices, or of a fleet, must not mix in one store.
+    #[test]
+    fn the_device_that_rasterises_counts() {
+        let settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
+        let engines = Engines::new(&models, &session, &CpuRasterizer);
+        let of = |device: &str| {
+            let (graph, inputs) = (GraphSegmenter::default(), inputs(Path::new("absent.png")));
+            identities(&settings, &engines, &graph, device, &inputs).expect("readable").0
+        };
+        assert!(of("cpu") != of("NVIDIA H100 F64") && of("cpu") != of(OF_A_FLEET) && of("cpu") == of("cpu"));
+    }
+
+    /// Files of equal path and length differ by content; so do masks in a single COCO file.
+    #[test]
+    fn photos_and_masks_count_by_content() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let photo = dir.path().join("a.png");
+        let (graph, mut found) = (GraphSegmenter::default(), Vec::new());
+        for content in ["one", "two", "one"] {
+            fs_err::write(&photo, content).expect("writes");
+            found.push(identity_with(|_, _| {}, &graph, &photo));
+        }
+        assert!(found[0] == found[2] && found[0] != found[1], "photos");
+
+        let (file, folder) = (dir.path().join("masks.json"), dir.path().join("masks"));
+        fs_err::create_dir_all(&folder).expect("makes");
+        for (path, given) in [(&file, &file), (&folder.join("a.json"), &folder)] {
+            found.clear();
+            for counts in ["[4,60]", "[5,59]", "[4,60]"] {
+                let annotation =
+                    format!(r#"{{"image_id": 1, "segmentation": {{"size": [8, 8], "counts": {counts}}}}}"#);
+                let images = r#"[{"id": 1, "file_name": "a.png"}]"#;
+                let text = format!(r#"{{"images": {images}, "annotations": [{annotation}]}}"#);
+                fs_err::write(path, text).expect("writes");
+                let masks = GivenMasks::open(given, Vec::new()).expect("opens");
+                found.push(identity_with(|_, _| {}, &masks, &photo));
+            }
+            assert!(found[0] == found[2] && found[0] != found[1], "{}", given.display());
+        }
+    }
+
+    #[test]
+    fn the_execution_provider_and_every_view_setting_count() {
+        let (graph, photo) = (GraphSegmenter::default(), Path::new("absent.png"));
+        let with = |change: &dyn Fn(&mut EncodeSettings, &mut SessionOptions)| {
+            identity_with(|settings, session| change(settings, session), &graph, photo)
+        };
+        let plain = with(&|_, _| {});
+        let changed = [
+            with(&|_, session| session.providers = vec![Provider::Cuda]),
+            with(&|settings, _| settings.view.min_mask_px += 1),
+            with(&|settings, _| settings.view.masks = Masks::Auto { n_levels: 2 }),
+            with(&|settings, _| settings.cells.limits.max_gaussians -= 1),
+        ];
+        assert!(changed.iter().all(|identity| *identity != plain));
+        // Later steps are no part of the identity.
+        assert_eq!(with(&|settings, _| settings.aggregation = crate::lift::Aggregation::default()), plain);
     }
 }

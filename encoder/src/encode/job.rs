@@ -9,9 +9,9 @@ use slag_common::container::ContainerError;
 use slag_common::{Hash32, View, durable};
 
 use super::error::EncodeError;
-use super::identity;
+use super::inputs;
 use super::settings::Restart;
-use super::sink::{ViewRecord, ViewSink};
+use super::view::{ViewRecord, ViewSink};
 use crate::lift::photos::{self, MaskOutline};
 use crate::lift::{ContributionError, ContributionFile, ViewContributions};
 use crate::segment::Segmenter;
@@ -34,28 +34,29 @@ pub(crate) struct JobStatus {
     pub is_published: bool,
     /// The step that it is at, or ended at.
     pub step: Option<String>,
+    #[serde(skip)]
+    pub(super) of_scene: Vec<u8>,
 }
 
 /// State of the store's kept views, if there are any. `db`: the store's catalogue, or a copy.
 pub(crate) fn job_status(db: &sled::Db) -> Result<Option<JobStatus>, EncodeError> {
     let tree = db.open_tree(TREE)?;
-    if !tree.contains_key(IDENTITY_KEY)? {
-        return Ok(None);
-    }
+    let Some(of_scene) = tree.get(IDENTITY_KEY)? else { return Ok(None) };
     let step = tree.get(STEP_KEY)?;
     Ok(Some(JobStatus {
         n_views: tree.scan_prefix(VIEW_PREFIX).count(),
         is_published: tree.contains_key(PUBLISHED_KEY)?,
         step: step.map(|name| String::from_utf8_lossy(&name).into_owned()),
+        of_scene: of_scene.to_vec(),
     }))
 }
 
 pub(crate) struct Job {
     records: sled::Tree,
     folder: PathBuf,
-    of_scene: Hash32,
+    pub(crate) of_scene: Hash32,
     /// By name.
-    id_of_view: BTreeMap<String, Hash32>,
+    pub(crate) id_of_view: BTreeMap<String, Hash32>,
 }
 
 impl Job {
@@ -104,7 +105,11 @@ impl Job {
                 Err(ContributionError::Damaged { path, source }) => {
                     format!("{}: {}", path.display(), first_clause(&source))
                 }
-                Err(ContributionError::Io(e)) if is_lost(&e) => e.to_string(),
+                Err(ContributionError::Io(e))
+                    if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::UnexpectedEof) =>
+                {
+                    e.to_string()
+                }
                 Err(e) => return Err(e.into()),
             };
             tracing::warn!("view {view} is made again: {what}");
@@ -127,10 +132,11 @@ impl Job {
         let of_path = |(_, id): &(&String, &Hash32)| stem.is_some_and(|stem| id.to_string() == stem);
         let Some((view, id)) = self.id_of_view.iter().find(of_path) else { return error.into() };
         match self.forget(*id) {
-            Ok(()) => {
-                let what = first_clause(source);
-                EncodeError::KeptView { view: view.clone(), path: path.clone(), what }
-            }
+            Ok(()) => EncodeError::Failed(format!(
+                "view {view}: {}: {}; run the same encode again: this view is made again, the others are kept",
+                path.display(),
+                first_clause(source)
+            )),
             Err(error) => error,
         }
     }
@@ -170,18 +176,6 @@ impl Job {
         self.contributions_path(view).with_extension("outlines")
     }
 
-    #[cfg(feature = "fleet")]
-    pub(crate) fn of_scene(&self) -> Hash32 {
-        self.of_scene
-    }
-
-    /// # Panics
-    /// If the view is none of this encode's.
-    #[cfg(feature = "fleet")]
-    pub(crate) fn id_of(&self, view: &str) -> Hash32 {
-        self.id_of_view[view]
-    }
-
     /// Marks a view as done; its files must be durable.
     pub(crate) fn mark_done(&self, view: &str, record: ViewRecord) -> Result<(), EncodeError> {
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
@@ -203,16 +197,6 @@ impl Job {
     pub(super) fn begin(&self, step: &str) -> Result<(), EncodeError> {
         self.records.insert(STEP_KEY, step)?;
         self.flush()
-    }
-
-    pub(super) fn is_kept(store: &Store, of_scene: Hash32) -> Result<bool, EncodeError> {
-        let tree = store.db().open_tree(TREE)?;
-        let found = tree.get(IDENTITY_KEY)?;
-        Ok(found.as_deref() == Some(&of_scene.0) && tree.scan_prefix(VIEW_PREFIX).next().is_some())
-    }
-
-    pub(super) fn finish(self) -> Result<(), EncodeError> {
-        self.clear()
     }
 
     /// Removes records and files of views that are none of this encode's.
@@ -274,7 +258,7 @@ impl Job {
         self.folder.join(VIEWS_FOLDER)
     }
 
-    fn clear(&self) -> Result<(), EncodeError> {
+    pub(super) fn clear(&self) -> Result<(), EncodeError> {
         self.clear_steps(3)
     }
 
@@ -311,7 +295,7 @@ impl ViewSink for Job {
 
     /// Both were read by now: if they still have the planned content, they had it then.
     fn check_unchanged(&self, view: &View, segmenter: &dyn Segmenter) -> Result<(), EncodeError> {
-        let now = identity::of_view(self.of_scene, view, segmenter)?;
+        let now = inputs::of_view(self.of_scene, view, segmenter)?;
         match now == self.id_of_view[&view.name] {
             true => Ok(()),
             false => Err(EncodeError::Changed { view: view.name.clone() }),
@@ -338,10 +322,6 @@ fn first_clause(error: &ContainerError) -> String {
     text.split("; ").next().unwrap_or_default().to_owned()
 }
 
-fn is_lost(error: &io::Error) -> bool {
-    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::UnexpectedEof)
-}
-
 fn record_key(id: Hash32) -> Vec<u8> {
     format!("{VIEW_PREFIX}{id}").into_bytes()
 }
@@ -349,7 +329,7 @@ fn record_key(id: Hash32) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::tests::DAMAGES;
+    use crate::store::tests::{DAMAGES, new_store};
 
     fn keep(job: &Job, view: &str) {
         let contributions = ViewContributions {
@@ -364,43 +344,46 @@ mod tests {
         job.keep(&view, &contributions, &[], ViewRecord::default()).expect("keeps");
     }
 
-    fn open_with(store: &Store, of_scene: u8, views: &[(&str, u8)]) -> Result<Job, EncodeError> {
+    fn try_open(store: &Store, of_scene: u8, views: &[(&str, u8)]) -> Result<Job, EncodeError> {
         let id_of_view = views.iter().map(|(name, id)| ((*name).to_owned(), Hash32([*id; 32]))).collect();
         Job::open(store, Hash32([of_scene; 32]), id_of_view, Restart::Never)
+    }
+
+    fn open(store: &Store, views: &[(&str, u8)]) -> Job {
+        try_open(store, 1, views).expect("begins or goes on")
+    }
+
+    fn names(job: &Job) -> Vec<String> {
+        job.done_views().expect("reads").into_keys().collect()
     }
 
     /// A view is done if its identity is: photos come, go and are replaced; leftovers go when the views are published.
     #[test]
     fn views_are_known_by_their_identities() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        let names = |job: &Job| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
-        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
+        let (_dir, store) = new_store();
+        let job = open(&store, &[("a", 1), ("b", 2)]);
         keep(&job, "a");
         keep(&job, "b");
         let of_b = job.contributions_path("b");
-        assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("c", 3)]).expect("goes on")), ["a"]);
+        assert_eq!(names(&open(&store, &[("a", 1), ("c", 3)])), ["a"]);
         // Another photo of the same name is not done, and does not replace the old one's file.
-        let replaced = open_with(&store, 1, &[("b", 4)]).expect("goes on");
+        let replaced = open(&store, &[("b", 4)]);
         assert!(names(&replaced).is_empty());
         keep(&replaced, "b");
-        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on");
-        assert!(names(&job) == ["a", "b"] && of_b.exists());
-        drop(job);
-        let kept = open_with(&store, 1, &[("a", 1)]).expect("goes on");
+        assert!(names(&open(&store, &[("a", 1), ("b", 2)])) == ["a", "b"] && of_b.exists());
+        let kept = open(&store, &[("a", 1)]);
         let of_a = kept.contributions_path("a");
         kept.keep_published().expect("publishes");
         assert!(of_a.exists() && !of_b.exists());
-        assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
+        assert_eq!(names(&open(&store, &[("a", 1), ("b", 2)])), ["a"]);
     }
 
     /// Records that are lost with the catalogue are rebuilt from the files: nothing is redone, and another scene does
     /// not drop them.
     #[test]
     fn a_job_outlives_its_records() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
+        let (dir, store) = new_store();
+        let job = open(&store, &[("a", 1), ("b", 2)]);
         job.begin("views").expect("records");
         keep(&job, "a");
         let status = job_status(store.db()).expect("reads").expect("a job");
@@ -410,23 +393,21 @@ mod tests {
         fs_err::remove_dir_all(dir.path().join("db")).expect("there");
         let store = Store::create_or_open(dir.path()).expect("opens");
         assert_eq!(job_status(store.db()).expect("reads"), None);
-        let done = |job: &Job| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
-        assert_eq!(done(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
-        assert!(matches!(open_with(&store, 2, &[("a", 1)]), Err(EncodeError::OtherJob { n_done: 1, .. })));
+        assert_eq!(names(&open(&store, &[("a", 1), ("b", 2)])), ["a"]);
+        assert!(matches!(try_open(&store, 2, &[("a", 1)]), Err(EncodeError::OtherJob { n_done: 1, .. })));
     }
 
     /// A published job, half dropped by a crash, neither comes back nor keeps another scene out.
     #[test]
     fn a_job_that_was_dropped_in_part_stays_dropped() {
         for n_steps in 0..=3 {
-            let dir = tempfile::tempdir().expect("a folder");
-            let store = Store::create_or_open(dir.path()).expect("opens");
-            let job = open_with(&store, 1, &[("a", 1)]).expect("begins");
+            let (_dir, store) = new_store();
+            let job = open(&store, &[("a", 1)]);
             keep(&job, "a");
             job.keep_published().expect("marks");
-            open_with(&store, 1, &[("a", 1)]).expect("goes on").clear_steps(n_steps).expect("drops");
-            let other = open_with(&store, 2, &[("a", 1)]).unwrap_or_else(|e| panic!("{n_steps} steps: {e}"));
-            assert!(other.done_views().expect("reads").is_empty(), "{n_steps} steps");
+            open(&store, &[("a", 1)]).clear_steps(n_steps).expect("drops");
+            let other = try_open(&store, 2, &[("a", 1)]).unwrap_or_else(|e| panic!("{n_steps} steps: {e}"));
+            assert!(names(&other).is_empty(), "{n_steps} steps");
         }
     }
 
@@ -436,19 +417,17 @@ mod tests {
     fn views_with_damaged_files_are_made_again() {
         for (number, damage) in DAMAGES.iter().enumerate() {
             for of_contributions in [true, false] {
-                let dir = tempfile::tempdir().expect("a folder");
-                let store = Store::create_or_open(dir.path()).expect("opens");
-                let open = || open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("opens");
-                let done = |job: &Job| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
+                let (_dir, store) = new_store();
+                let open = || open(&store, &[("a", 1), ("b", 2)]);
                 let job = open();
                 keep(&job, "a");
                 keep(&job, "b");
                 damage(&if of_contributions { job.contributions_path("a") } else { job.outlines_path("a") });
                 let job = open();
-                assert_eq!(done(&job), ["b"], "damage {number}");
+                assert_eq!(names(&job), ["b"], "damage {number}");
                 assert!(!job.contributions_path("a").exists() && !job.outlines_path("a").exists());
                 keep(&job, "a");
-                assert_eq!(done(&open()), ["a", "b"], "damage {number}");
+                assert_eq!(names(&open()), ["a", "b"], "damage {number}");
             }
         }
     }
@@ -456,9 +435,8 @@ mod tests {
     /// A wrong checksum found by the lift: that view's record goes, and the error says what to do.
     #[test]
     fn a_view_that_the_lift_finds_damaged_is_forgotten() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
+        let (_dir, store) = new_store();
+        let job = open(&store, &[("a", 1), ("b", 2)]);
         keep(&job, "a");
         keep(&job, "b");
         let source = ContainerError::Checksum { id: 6, offset_bytes: 64, expected: 1, found: 2 };
@@ -466,34 +444,31 @@ mod tests {
         let error = job.forget_damaged(found).to_string();
         assert!(error.contains("view a") && error.contains("run the same encode again"), "{error}");
         assert!(error.contains("section 6") && !error.contains("delete it"), "{error}");
-        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on");
-        assert_eq!(job.done_views().expect("reads").into_keys().collect::<Vec<_>>(), ["b"]);
+        assert_eq!(names(&open(&store, &[("a", 1), ("b", 2)])), ["b"]);
     }
 
     #[test]
     fn a_restart_takes_nothing_over() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
+        let (_dir, store) = new_store();
         for (restart, n_done) in [(Restart::Never, 1), (Restart::IfOther, 1), (Restart::Always, 0)] {
-            keep(&open_with(&store, 1, &[("a", 1)]).expect("opens"), "a");
+            keep(&open(&store, &[("a", 1)]), "a");
             let id_of_view = BTreeMap::from([("a".to_owned(), Hash32([1; 32]))]);
             let job = Job::open(&store, Hash32([1; 32]), id_of_view, restart).expect("opens");
-            assert_eq!(job.done_views().expect("reads").len(), n_done, "{restart:?}");
+            assert_eq!(names(&job).len(), n_done, "{restart:?}");
         }
     }
 
     /// A published job may be dropped, but not views that a later run adds before publishing again.
     #[test]
     fn views_added_to_a_published_job_are_not_dropped_silently() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        let open = |of_scene| open_with(&store, of_scene, &[("a", 1), ("b", 2)]);
+        let (_dir, store) = new_store();
+        let open = |of_scene| try_open(&store, of_scene, &[("a", 1), ("b", 2)]);
         let job = open(1).expect("begins");
         keep(&job, "a");
         job.keep_published().expect("marks");
         keep(&open(1).expect("goes on"), "b");
         assert!(matches!(open(2), Err(EncodeError::OtherJob { n_done: 2, .. })));
         open(1).expect("goes on").keep_published().expect("marks");
-        assert!(open(2).expect("what is published may go").done_views().expect("reads").is_empty());
+        assert!(names(&open(2).expect("what is published may go")).is_empty());
     }
 }

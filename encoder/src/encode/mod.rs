@@ -1,29 +1,22 @@
 //! The pipeline: photos, poses and a splat in, a published generation of shards out.
 //!
-//! Views are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet. They are independent: a
+//! Views are done by an `Executor` (`executor.rs`): this machine, or a fleet. They are independent: a
 //! killed encode resumes after the last finished view, if it is the same encode (`identity.rs`). Later steps read
 //! contributions in the order of the views' names, so the store's bytes do not depend on threads, on the order of views
 //! or on interruptions.
 
-mod cell;
 mod cells;
 mod context;
 pub mod coverage;
-mod drawings;
 mod error;
-mod executor;
 pub mod front;
-mod here;
-mod identity;
 mod inputs;
 mod job;
 mod pipeline;
 mod plan;
-mod preset;
 mod publish;
 mod report;
 mod settings;
-mod sink;
 mod view;
 mod views;
 
@@ -34,17 +27,17 @@ use crate::memory::Phase;
 use crate::progress::Progress;
 use crate::store::{Store, StoreError};
 use context::RunContext;
-use executor::Executor;
+use views::Executor;
 
 pub use context::Engines;
 pub(crate) use error::EncodeError;
 pub(crate) use inputs::count_inputs;
 pub(crate) use job::{JobStatus, job_status};
-pub use preset::Preset;
 pub use report::EncodeSummary;
 #[cfg(feature = "fleet")]
 pub(crate) use report::SkippedView;
 pub(crate) use report::{GpuReport, StageReport};
+pub use settings::Preset;
 #[cfg(feature = "fleet")]
 pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
@@ -53,13 +46,11 @@ pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, Restart,
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet_parts {
     pub(crate) use super::context::RunContext;
-    pub(crate) use super::executor::{Executor, ViewsRun};
-    pub(crate) use super::here::work_off;
-    pub(crate) use super::identity::{OF_A_FLEET, of_scene};
+    pub(crate) use super::inputs::{OF_A_FLEET, of_scene};
     pub(crate) use super::plan::{Plan, segmenter_of};
     pub(crate) use super::report::LeftOut;
-    pub(crate) use super::sink::{PhotoSource, ViewRecord, ViewSink};
-    pub(crate) use super::view::{ViewStages, ViewTools};
+    pub(crate) use super::view::{PhotoSource, ViewRecord, ViewSink, ViewStages, ViewTools};
+    pub(crate) use super::views::{Executor, ViewsRun, work_off};
 }
 
 /// Encodes a scene into a store and publishes it as the next generation.
@@ -72,7 +63,7 @@ pub fn encode(
     progress: &dyn Progress,
     cancel: &AtomicBool,
 ) -> Result<EncodeSummary, EncodeError> {
-    encode_by(&here::Here, settings, engines, progress, cancel)
+    encode_by(&views::Here, settings, engines, progress, cancel)
 }
 
 /// Like [`encode`]; `executor` does the views.
@@ -109,20 +100,20 @@ fn encode_into(
     let store = Store::create_or_open(&settings.output.store)?;
     store.check_keys()?;
     if let Some(planned) = &settings.inputs.planned {
-        drawings::make(settings, planned, engines, context)?;
+        inputs::make(settings, planned, engines, context)?;
     }
     let inputs = inputs::Inputs::read(settings, context)?;
     context.begin_phase(Phase::Plan);
     let plan = plan::plan(settings, engines, &store, &inputs, &executor.rasterizer(engines), context)?;
     context.begin_phase(Phase::Views);
     plan.job.begin("views")?;
-    let views = views::run_views(&plan, executor, context)?;
-    let occupancy = views::look_around(&plan, &views, context)?;
-    let landmarks = views::find_landmarks(&plan, &views, context)?;
+    let views = views::run_views(&plan, executor)?;
+    let occupancy = views::look_around(&plan, &views)?;
+    let landmarks = views::find_landmarks(&plan, &views)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
     let n_views = views.used.len();
-    let built = cells::build_cells(&plan, &views, occupancy, landmarks, context);
+    let built = cells::build_cells(&plan, &views, occupancy, landmarks);
     let built = built.map_err(|error| match error {
         EncodeError::Contributions(ContributionError::Cancelled) => {
             EncodeError::Interrupted { n_done: n_views, n_views }
@@ -133,5 +124,5 @@ fn encode_into(
     })?;
     context.begin_phase(Phase::Publish);
     plan.job.begin("publish")?;
-    publish::publish(plan, views, built, executor, context)
+    publish::publish(plan, views, built, executor)
 }

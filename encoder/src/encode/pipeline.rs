@@ -4,7 +4,6 @@
 //! advanced view, so that views leave before others enter and few are in memory. Stages on the processor share its
 //! cores; one that waits for a GPU or the disk takes none. Without devices this is a thread a core, each with a view.
 
-use std::any::Any;
 use std::collections::VecDeque;
 use std::ops::RangeInclusive;
 use std::panic::{self, AssertUnwindSafe};
@@ -46,17 +45,8 @@ struct Schedule<T, E> {
     n_ended: usize,
     n_ended_when_asked: usize,
     busy_secs: Vec<f64>,
-    failure: Option<Failure<E>>,
-}
-
-enum Failure<E> {
-    Error(E),
-    Panic(Box<dyn Any + Send>),
-}
-
-enum Task<T> {
-    Begin,
-    Step(usize, T),
+    /// `Err` after a panic.
+    failure: Option<std::thread::Result<E>>,
 }
 
 /// Takes items of `source` through the stages, `n_cores` at a time on the processor. A source that has nothing is
@@ -73,7 +63,7 @@ pub(super) fn run<T: Send, E: Send>(
     step: impl Fn(usize, T) -> Result<Option<T>, E> + Sync,
 ) -> Result<Vec<StageReport>, E> {
     let start = Instant::now();
-    let pipeline = Pipeline { stages, n_cores, source: Mutex::new(source), step, changed: Condvar::new() };
+    let (source, changed) = (Mutex::new(source), Condvar::new());
     let schedule = Mutex::new(Schedule {
         waiting: stages.iter().map(|_| VecDeque::new()).collect(),
         n_running: vec![0; stages.len()],
@@ -85,15 +75,48 @@ pub(super) fn run<T: Send, E: Send>(
         failure: None,
     });
     let n_elsewhere: usize = stages.iter().filter(|stage| !stage.on_cpu).map(|stage| stage.n_slots).sum();
+    let lock = || schedule.lock().unwrap_or_else(PoisonError::into_inner);
+    let timed_step = |stage: usize, item: T| {
+        let begun = Instant::now();
+        let result = step(stage, item);
+        Some((begun.elapsed().as_secs_f64(), result))
+    };
+    let work = || {
+        let mut schedule = lock();
+        while schedule.failure.is_none() {
+            let Some((at, item)) = schedule.take(stages, n_cores) else {
+                // Nothing is under way and nothing can begin.
+                if schedule.n_running.iter().all(|n| *n == 0) {
+                    break;
+                }
+                schedule = changed.wait(schedule).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            drop(schedule);
+            // A panic must not leave the other threads waiting.
+            let done = panic::catch_unwind(AssertUnwindSafe(|| match item {
+                Some(item) => timed_step(at, item),
+                None => {
+                    let item = source.lock().unwrap_or_else(PoisonError::into_inner).next();
+                    lock().end_asking(item.is_some());
+                    changed.notify_all();
+                    timed_step(at, item?)
+                }
+            }));
+            schedule = lock();
+            schedule.end_step(at, done);
+            changed.notify_all();
+        }
+    };
     std::thread::scope(|scope| {
         for _ in 0..n_cores + n_elsewhere {
-            scope.spawn(|| pipeline.work(&schedule));
+            scope.spawn(work);
         }
     });
     let Schedule { busy_secs, failure, .. } = schedule.into_inner().unwrap_or_else(PoisonError::into_inner);
     match failure {
-        Some(Failure::Error(error)) => return Err(error),
-        Some(Failure::Panic(panic)) => panic::resume_unwind(panic),
+        Some(Ok(error)) => return Err(error),
+        Some(Err(panic)) => panic::resume_unwind(panic),
         None => {}
     }
     let wall_secs = start.elapsed().as_secs_f64();
@@ -107,64 +130,12 @@ pub(super) fn run<T: Send, E: Send>(
     Ok(stages.iter().zip(busy_secs).map(report).collect())
 }
 
-struct Pipeline<'a, S, F> {
-    stages: &'a [Stage],
-    n_cores: usize,
-    source: Mutex<S>,
-    step: F,
-    changed: Condvar,
-}
-
-impl<S, F> Pipeline<'_, S, F> {
-    fn work<T, E>(&self, schedule: &Mutex<Schedule<T, E>>)
-    where
-        S: Iterator<Item = T>,
-        F: Fn(usize, T) -> Result<Option<T>, E>,
-    {
-        let lock = || schedule.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut schedule = lock();
-        while schedule.failure.is_none() {
-            let Some((at, task)) = schedule.take(self.stages, self.n_cores) else {
-                // Nothing is under way and nothing can begin.
-                if schedule.n_running.iter().all(|n| *n == 0) {
-                    break;
-                }
-                schedule = self.changed.wait(schedule).unwrap_or_else(PoisonError::into_inner);
-                continue;
-            };
-            drop(schedule);
-            // A panic must not leave the other threads waiting.
-            let done = panic::catch_unwind(AssertUnwindSafe(|| match task {
-                Task::Step(stage, item) => Some(self.timed_step(stage, item)),
-                Task::Begin => {
-                    let item = self.source.lock().unwrap_or_else(PoisonError::into_inner).next();
-                    lock().end_asking(item.is_some());
-                    self.changed.notify_all();
-                    item.map(|item| self.timed_step(0, item))
-                }
-            }));
-            schedule = lock();
-            schedule.end_step(at, done);
-            self.changed.notify_all();
-        }
-    }
-
-    fn timed_step<T, E>(&self, stage: usize, item: T) -> (f64, Result<Option<T>, E>)
-    where
-        F: Fn(usize, T) -> Result<Option<T>, E>,
-    {
-        let begun = Instant::now();
-        let result = (self.step)(stage, item);
-        (begun.elapsed().as_secs_f64(), result)
-    }
-}
-
 /// Seconds and result of a step; `None` if the source had no item for it.
 type StepOutcome<T, E> = Option<(f64, Result<Option<T>, E>)>;
 
 impl<T, E> Schedule<T, E> {
-    /// Takes the most advanced item that can go on, with its stage.
-    fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, Task<T>)> {
+    /// Takes the most advanced item that can go on, with its stage; `None` in place of one that is to begin.
+    fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, Option<T>)> {
         let on_cpu = stages.iter().zip(&self.n_running).filter(|(stage, _)| stage.on_cpu);
         let has_core = on_cpu.map(|(_, n)| n).sum::<usize>() < n_cores;
         for (at, stage) in stages.iter().enumerate().rev() {
@@ -175,17 +146,14 @@ impl<T, E> Schedule<T, E> {
             if self.n_running[at] >= stage.n_slots || !has_room || (stage.on_cpu && !has_core) {
                 continue;
             }
-            let task = match at {
-                0 if self.is_asking || self.has_no_more => None,
-                0 => Some(Task::Begin),
-                _ => self.waiting[at].pop_front().map(|item| Task::Step(at, item)),
-            };
-            if let Some(task) = task {
+            let item = self.waiting[at].pop_front();
+            let may_begin = at == 0 && !self.is_asking && !self.has_no_more;
+            if item.is_some() || may_begin {
                 self.n_running[at] += 1;
                 if at == 0 {
                     (self.is_asking, self.n_ended_when_asked) = (true, self.n_ended);
                 }
-                return Some((at, task));
+                return Some((at, item));
             }
         }
         None
@@ -201,7 +169,7 @@ impl<T, E> Schedule<T, E> {
         let (secs, result) = match done {
             Ok(Some(done)) => done,
             Ok(None) => return,
-            Err(panic) => return self.failure = Some(Failure::Panic(panic)),
+            Err(panic) => return self.failure = Some(Err(panic)),
         };
         self.busy_secs[at] += secs;
         self.n_ended += 1;
@@ -209,7 +177,7 @@ impl<T, E> Schedule<T, E> {
         match result {
             Ok(Some(item)) if at + 1 < self.waiting.len() => self.waiting[at + 1].push_back(item),
             Ok(_) => {}
-            Err(error) => drop(self.failure.get_or_insert(Failure::Error(error))),
+            Err(error) => drop(self.failure.get_or_insert(Ok(error))),
         }
     }
 }

@@ -7,11 +7,9 @@ use std::time::Instant;
 use slag_common::Hash32;
 use slag_models::SessionOptions;
 
-use super::context::Engines;
-use super::context::RunContext;
+use super::context::{Engines, RunContext};
 use super::coverage::{self, Coverage};
 use super::error::EncodeError;
-use super::identity;
 use super::inputs::{self, Inputs};
 use super::job::{Job, JobStatus, job_status};
 use super::report::LostViews;
@@ -19,18 +17,17 @@ use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSetting
 use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::ground::{self, Standing};
-use crate::landmarks;
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
-use crate::objects;
 use crate::raster::{self, LoadedScene, RasterView};
 use crate::segment::{
     GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter, WithStanding,
 };
-use crate::shard;
 use crate::store::{Store, StoreReader};
+use crate::{landmarks, objects, shard};
 
 pub(crate) struct Plan<'a> {
+    pub(crate) context: &'a RunContext<'a>,
     pub(crate) settings: &'a EncodeSettings,
     pub(crate) engines: &'a Engines<'a>,
     pub(crate) inputs: &'a Inputs,
@@ -51,6 +48,7 @@ pub(crate) struct Plan<'a> {
 impl Plan<'_> {
     pub(super) fn view_tools(&self) -> ViewTools<'_> {
         ViewTools {
+            context: self.context,
             engines: self.engines,
             settings: &self.settings.view,
             n_threads: self.settings.run.threads,
@@ -71,7 +69,7 @@ pub(super) fn plan<'a>(
     store: &'a Store,
     inputs: &'a Inputs,
     rasterizer: &str,
-    context: &RunContext<'_>,
+    context: &'a RunContext<'a>,
 ) -> Result<Plan<'a>, EncodeError> {
     let memory = memory_plan(settings, inputs, engines);
     memory.rest(0)?;
@@ -83,19 +81,19 @@ pub(super) fn plan<'a>(
     if let Some(without) = segmenter.check_views(&inputs.views, settings.run.strict)? {
         tracing::warn!("{without}");
     }
-    let ids = context.time("identity", || {
-        let of = || identity::identities(settings, engines, segmenter.as_ref(), rasterizer, inputs);
+    let (of_scene, id_of_view) = context.time("identity", || {
+        let of = || inputs::identities(settings, engines, segmenter.as_ref(), rasterizer, inputs);
         context.install(of)
     })?;
-    let id_of_view = inputs.views.iter().map(|view| view.name.clone()).zip(ids.of_view).collect();
-    let lost_views = lost_views(store, ids.of_scene)?;
-    let job = Job::open(store, ids.of_scene, id_of_view, settings.run.restart)?;
+    let lost_views = lost_views(store, of_scene)?;
+    let job = Job::open(store, of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
     let start = Instant::now();
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
-    let mut plan = Plan {
+    let plan = Plan {
+        context,
         settings,
         engines,
         inputs,
@@ -110,18 +108,10 @@ pub(super) fn plan<'a>(
         coverage,
         coverage_secs,
     };
-    plan.reserve_views()?;
-    Ok(plan)
-}
-
-impl Plan<'_> {
-    fn reserve_views(&mut self) -> Result<(), EncodeError> {
-        let mut memory = self.memory.clone();
-        self.view_tools().reserve(&mut memory, &self.inputs.views);
-        memory.rest(0)?;
-        self.memory = memory;
-        Ok(())
-    }
+    let mut memory = plan.memory.clone();
+    plan.view_tools().reserve(&mut memory, &inputs.views);
+    memory.rest(0)?;
+    Ok(Plan { memory, ..plan })
 }
 
 /// Encoder of the store's generation, if this encode publishes another's vectors: robots refuse them until they have
@@ -151,11 +141,9 @@ fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<St
 
 /// Finds and reports kept views that cannot be reused; an unfinished encode is refused later, not replaced.
 fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, EncodeError> {
-    let kept = job_status(store.db())?.filter(|status| status.n_views > 0 && status.is_published);
+    let is_lost = |kept: &JobStatus| kept.n_views > 0 && kept.is_published && kept.of_scene != of_scene.0;
+    let kept = job_status(store.db())?.filter(is_lost);
     let Some(JobStatus { n_views, .. }) = kept else { return Ok(None) };
-    if Job::is_kept(store, of_scene)? {
-        return Ok(None);
-    }
     let reason = format!(
         "splat, models, device or settings of views are others than those of the {n_views} kept views, so no view is taken \
          over: what a Gaussian contributes to a photo depends on all those before it"
@@ -200,7 +188,10 @@ pub(crate) fn segmenter_of(
     } else if engines.models.patches_per_side().is_some() {
         Ok(Box::new(NoMasks))
     } else {
-        Err(EncodeError::NoPatches { model: engines.models.encoder_id().to_string() })
+        Err(EncodeError::Failed(format!(
+            "{} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out",
+            engines.models.encoder_id()
+        )))
     }
 }
 
@@ -287,7 +278,9 @@ mod tests {
         let engines = Engines::new(&models, &session, &CpuRasterizer);
         let refused =
             memory_plan(&settings, &inputs, &engines).rest(0).expect_err("the objects' lists come on top");
-        assert!(refused.is_before_views && refused.parts[0].purpose.contains("superpoints"), "{refused}");
+        let most = refused.to_string();
+        let (_, most) = most.split_once("needed at least: ").expect("before the first view");
+        assert!(most.split(", ").next().is_some_and(|most| most.contains("superpoints")), "{refused}");
         settings.run.memory_bytes *= 2;
         memory_plan(&settings, &inputs, &engines).rest(0).expect("fits");
     }

@@ -5,20 +5,16 @@ use std::io;
 use std::time::Instant;
 
 use slag_common::Hash32;
-use slag_common::manifest::{
-    self, Calibration, CellRecord, EncoderRecord, Manifest, ObjectRecord, TextModelRecord,
-};
+use slag_common::manifest::{self, Calibration, EncoderRecord, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::ScoreErrors;
 use slag_models::ModelDir;
 
-use super::cells::{BuiltCells, Counts};
-use super::context::RunContext;
+use super::cells::{BuiltCells, FinishedCell};
 use super::error::EncodeError;
-use super::executor::Executor;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary, LeftOut};
 use super::settings::Masks;
-use super::views::DoneViews;
+use super::views::{DoneViews, Executor};
 use crate::store::{ModelsRecord, Store};
 
 /// Publishes the built cells, ends the job and returns the summary.
@@ -30,15 +26,18 @@ pub(super) fn publish(
     views: DoneViews<'_>,
     built: BuiltCells,
     executor: &dyn Executor,
-    context: &RunContext<'_>,
 ) -> Result<EncodeSummary, EncodeError> {
     let n_gaussians = plan.inputs.scene.len() - plan.inputs.split.n_rejected;
-    if built.n_without_evidence >= n_gaussians as u64 && !plan.settings.run.allow_empty {
-        let Counts { n_views_without_masks, n_masks, n_entries, .. } = built.counts;
+    if built.n_without_evidence() >= n_gaussians as u64 && !plan.settings.run.allow_empty {
+        let BuiltCells { n_views_without_masks, n_masks, n_entries, .. } = built;
         let n_views = views.used.len();
-        return Err(EncodeError::NoEvidence { n_views, n_views_without_masks, n_masks, n_entries });
+        return Err(EncodeError::Failed(format!(
+            "no Gaussian has an embedding, so nothing is published: {n_views} views ({n_views_without_masks} without masks) \
+             have {n_masks} masks and {n_entries} contributions; see whether masks, poses and splat fit with `slag-encoder \
+             check`, or publish it all the same with --allow-empty"
+        )));
     }
-    warn_of_single_masks(&plan, &built.counts, views.used.len());
+    warn_of_single_masks(&plan, &built, views.used.len());
     let generation = plan.store.next_generation()?;
     let text_model = plan
         .settings
@@ -51,8 +50,9 @@ pub(super) fn publish(
     plan.store.publish(&manifest, &built.extras)?;
     let mut summary = summary(&plan, &views, built, &manifest);
     leave_out_blind(&mut summary);
+    let context = plan.context;
     // With views left to do, contributions stay for the next encode.
-    let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
+    let has_open = views.records.len() + views.run.skipped.len() < plan.inputs.views.len();
     let store = plan.store;
     if let Err(error) = tidy_up(plan, has_open, manifest.encoder.id) {
         let path = store.dir().display();
@@ -72,9 +72,10 @@ pub(super) fn publish(
 fn tidy_up(plan: Plan<'_>, has_open: bool, encoder: Hash32) -> Result<(), EncodeError> {
     let models = plan.settings.output.models.clone();
     plan.store.remember_models(&ModelsRecord { encoder, models })?;
-    match plan.settings.run.keep_views || has_open {
-        true => plan.job.keep_published()?,
-        false => plan.job.finish()?,
+    if plan.settings.run.keep_views || has_open {
+        plan.job.keep_published()?
+    } else {
+        plan.job.clear()?
     }
     plan.store.prune()?;
     Ok(())
@@ -95,10 +96,10 @@ fn carry_text_model(store: &Store, models: &ModelDir) -> Result<TextModelRecord,
 }
 
 /// Warns of given masks that look like a trainer's, which say what to keep or ignore.
-fn warn_of_single_masks(plan: &Plan<'_>, counts: &Counts, n_views: usize) {
+fn warn_of_single_masks(plan: &Plan<'_>, built: &BuiltCells, n_views: usize) {
     let is_given = matches!(plan.settings.view.masks, Masks::Given { .. });
-    let n_with_masks = n_views - counts.n_views_without_masks;
-    if is_given && n_with_masks > 1 && counts.n_masks == n_with_masks {
+    let n_with_masks = n_views - built.n_views_without_masks;
+    if is_given && n_with_masks > 1 && built.n_masks == n_with_masks {
         tracing::warn!(
             "each photo has one mask, as if of what to keep or ignore; objects need a mask for each thing"
         );
@@ -133,23 +134,22 @@ fn manifest(
             text_model,
         },
         n_gaussians: (inputs.scene.len() - inputs.split.n_rejected) as u64,
-        n_without_evidence: built.n_without_evidence,
+        n_without_evidence: built.n_without_evidence(),
         n_rejected: inputs.split.n_rejected as u64,
-        cells: built.records.clone(),
+        cells: built.cells.iter().map(|cell| cell.record.clone()).collect(),
     }
 }
 
 fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: &Manifest) -> EncodeSummary {
-    let cells: Vec<CellReport> = built.records.iter().map(|record| cell_report(record, &built)).collect();
+    let cells: Vec<CellReport> = built.cells.iter().zip(&built.n_entries_of_cell).map(cell_report).collect();
     let mut shard_bytes: BTreeMap<String, u64> = BTreeMap::new();
     for (profile, len_bytes) in cells.iter().flat_map(|cell| &cell.shard_bytes) {
         *shard_bytes.entry(profile.clone()).or_default() += len_bytes;
     }
-    let Counts { n_views_without_masks, n_masks, n_regions, n_entries, views: views_report } = built.counts;
     EncodeSummary {
         generation: manifest.generation,
         n_gaussians: manifest.n_gaussians,
-        n_without_evidence: built.n_without_evidence,
+        n_without_evidence: built.n_without_evidence(),
         n_rejected: manifest.n_rejected,
         n_views: views.used.len(),
         n_views_with_photo: plan.inputs.views.len(),
@@ -160,24 +160,24 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         n_views_resumed: views.n_resumed,
         lost_views: plan.lost_views.clone(),
         encoder_before: plan.encoder_before.clone(),
-        n_views_without_masks,
+        n_views_without_masks: built.n_views_without_masks,
         skipped_views: views.skipped.clone(),
-        n_masks,
-        n_regions,
-        n_entries,
+        n_masks: built.n_masks,
+        n_regions: built.n_regions,
+        n_entries: built.n_entries,
         n_cells: cells.len(),
         n_centroids: cells.iter().map(|cell| u64::from(cell.n_centroids)).sum(),
         objects: built.objects,
         occupancy: built.occupancy,
         shard_bytes,
         cells,
-        views: views_report,
+        views: built.views,
         busy_secs: BTreeMap::new(),
-        view_stages: views.stages.clone(),
+        view_stages: views.run.stages.clone(),
         phases: Vec::new(),
         views_secs: views.secs,
         wall_secs: 0.0,
-        images_on: views.images_on.clone(),
+        images_on: views.run.images_on.clone(),
         encoder: plan.engines.models.encoder_id().to_string(),
     }
 }
@@ -197,15 +197,16 @@ fn leave_out_blind(summary: &mut EncodeSummary) {
     summary.skipped_views.extend(blind);
 }
 
-fn cell_report(record: &CellRecord, built: &BuiltCells) -> CellReport {
+fn cell_report((cell, n_entries): (&FinishedCell, &u64)) -> CellReport {
+    let record = &cell.record;
     let relative = |errors: &ScoreErrors| errors.mean / errors.spread.max(f32::MIN_POSITIVE);
     let shards = || record.shards.iter().map(|(profile, shard)| (profile.to_string(), shard));
     CellReport {
         cell_id: record.cell_id,
         n_gaussians: record.n_gaussians,
-        n_entries: built.n_entries[record.cell_id as usize],
+        n_entries: *n_entries,
         n_centroids: record.shards.values().map(|shard| shard.n_centroids).max().unwrap_or(0),
-        n_subspaces: built.n_subspaces[record.cell_id as usize],
+        n_subspaces: cell.n_subspaces,
         shard_bytes: shards().map(|(profile, shard)| (profile, shard.len_bytes)).collect(),
         score_error: shards().map(|(profile, shard)| (profile, relative(&shard.score_errors))).collect(),
     }

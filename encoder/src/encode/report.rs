@@ -100,13 +100,6 @@ pub struct GpuReport {
     pub(crate) busy_share: f64,
 }
 
-impl StageReport {
-    pub(super) fn add_gpus(&mut self, loads: Vec<GpuLoad>, wall_secs: f64) {
-        let report = |load: GpuLoad| GpuReport { busy_share: load.busy_secs / wall_secs, load };
-        self.gpus = loads.into_iter().map(report).collect();
-    }
-}
-
 /// A step of the run. The steps follow each other and add up to the run's time.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct PhaseReport {

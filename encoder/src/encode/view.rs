@@ -1,12 +1,14 @@
 //! The stages of one view: (fetch,) decode, (depth,) segment, crop, embed, raster, write.
 //!
-//! Each stage is a method that takes what the one before returns.
+//! Each stage is a method that takes what the one before returns. Where an encode is spread over machines, photos come
+//! from a [`PhotoSource`] and contributions go to a [`ViewSink`].
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
 use image::RgbImage;
+use serde::{Deserialize, Serialize};
 use slag_common::View;
 use slag_models::preprocess::Preprocess;
 use slag_models::{Crop, ImageEncoder, ModelError, SessionOptions};
@@ -16,7 +18,6 @@ use super::error::EncodeError;
 use super::inputs;
 use super::pipeline::{self, Stage};
 use super::settings::{Regions, ViewSettings};
-use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
 use crate::embed::{self, PatchUse, SharedEncoders, Surroundings};
 use crate::ingest::{self, LoadedImage, OddPhotos};
@@ -27,13 +28,47 @@ use crate::masks::patches::{Windows, patch_masks};
 use crate::masks::regions::{absorb_slivers, partition};
 use crate::masks::{self, Mask, RegionMap};
 use crate::memory::MemoryPlan;
-use crate::raster::{GpuSlots, LoadedScene, RasterView};
+use crate::raster::{LoadedScene, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
 
 const PICTURE_WIDTH_PX: u32 = 480;
 
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ViewRecord {
+    /// Width at which its weights were rasterised.
+    pub(crate) raster_width_px: u32,
+    /// Seconds in its stages before this record.
+    pub(crate) secs: f32,
+}
+
+pub(crate) trait PhotoSource: Sync {
+    fn n_at_once(&self) -> usize;
+
+    /// Fetches a view's files to its paths; returns whether the view is still to be done.
+    fn fetch(&self, view: &View) -> Result<bool, EncodeError>;
+}
+
+pub(crate) trait ViewSink: Sync {
+    fn n_at_once(&self) -> usize;
+
+    /// Refuses a view whose photo or masks changed since planning; those fetched by hash cannot have.
+    fn check_unchanged(&self, _view: &View, _segmenter: &dyn Segmenter) -> Result<(), EncodeError> {
+        Ok(())
+    }
+
+    /// Keeps a view's contributions and outlines; they are durable on return.
+    fn keep(
+        &self,
+        view: &View,
+        contributions: &ViewContributions,
+        outlines: &[MaskOutline],
+        record: ViewRecord,
+    ) -> Result<(), EncodeError>;
+}
+
 #[derive(Clone, Copy)]
 pub(crate) struct ViewTools<'a> {
+    pub(crate) context: &'a RunContext<'a>,
     pub(crate) engines: &'a Engines<'a>,
     pub(crate) settings: &'a ViewSettings,
     pub(crate) n_threads: usize,
@@ -47,8 +82,7 @@ pub(crate) struct ViewTools<'a> {
 }
 
 pub(crate) struct ViewStages<'a> {
-    tools: ViewTools<'a>,
-    context: &'a RunContext<'a>,
+    pub(super) tools: ViewTools<'a>,
     /// How crops become the image encoder's squares; `None` if it takes any size.
     preprocess: Option<Preprocess>,
     encoders: Encoders,
@@ -66,7 +100,7 @@ enum Encoders {
 }
 
 pub(crate) struct Work<'v> {
-    view: &'v View,
+    pub(super) view: &'v View,
     next: Next,
     /// Of the stages so far.
     secs: f32,
@@ -75,23 +109,15 @@ pub(crate) struct Work<'v> {
 enum Next {
     Fetch,
     Decode,
-    Depth(Photo),
-    Segment(Photo),
-    Crop(Segmented),
+    Depth(LoadedImage),
+    /// With camera z of the scene per pixel, if the segmenter needs it.
+    Segment(LoadedImage, Option<Vec<f32>>),
+    Crop(LoadedImage, Vec<Mask>),
     Embed(Cropped),
-    Raster(Embedded),
-    Write(Lifted),
-}
-
-struct Photo {
-    loaded: LoadedImage,
-    /// Camera z of the scene per pixel; absent if the segmenter does not need it.
-    depth: Option<Vec<f32>>,
-}
-
-struct Segmented {
-    loaded: LoadedImage,
-    masks: Vec<Mask>,
+    /// With a unit vector for each mask.
+    Raster(Vec<f32>, Partition),
+    /// With the width at which weights were rasterised.
+    Write(ViewContributions, Vec<MaskOutline>, u32),
 }
 
 struct Cropped {
@@ -118,32 +144,16 @@ struct Partition {
     outlines: Vec<MaskOutline>,
 }
 
-struct Embedded {
-    /// `[n_masks][dim]`, unit.
-    vectors: Vec<f32>,
-    partition: Partition,
-}
-
-struct Lifted {
-    contributions: ViewContributions,
-    outlines: Vec<MaskOutline>,
-    raster_width_px: u32,
-}
-
 impl<'v> Work<'v> {
     pub(super) fn begin(view: &'v View, is_here: bool) -> Self {
         Self { view, next: if is_here { Next::Decode } else { Next::Fetch }, secs: 0.0 }
-    }
-
-    pub(super) fn view(&self) -> &'v View {
-        self.view
     }
 }
 
 impl ViewTools<'_> {
     /// In the order of [`ViewStages::step`].
     pub(super) fn stages(&self) -> Vec<Stage> {
-        let raster_slots = self.scene.gpus().map(GpuSlots::n_views);
+        let raster_slots = self.scene.views_on_gpus();
         let on_cpu = |name| Stage { name, n_slots: self.n_threads, on_cpu: true };
         let on_device = |name, n_slots: Option<usize>| match n_slots {
             Some(n_slots) => Stage { name, n_slots, on_cpu: false },
@@ -191,7 +201,7 @@ impl ViewTools<'_> {
 }
 
 impl<'a> ViewStages<'a> {
-    pub(crate) fn new(tools: ViewTools<'a>, context: &'a RunContext<'a>) -> Self {
+    pub(crate) fn new(tools: ViewTools<'a>) -> Self {
         let (models, session) = (tools.engines.models.clone(), tools.engines.session.clone());
         let preprocess = models.preprocess();
         let is_on_cpu = session.is_on_cpu();
@@ -208,17 +218,12 @@ impl<'a> ViewStages<'a> {
         };
         Self {
             tools,
-            context,
             preprocess,
             encoders,
             images_on,
             odd_photos: OddPhotos::default(),
             n_unrepresentable: AtomicUsize::new(0),
         }
-    }
-
-    pub(super) fn tools(&self) -> &ViewTools<'a> {
-        &self.tools
     }
 
     pub(super) fn loads(&self, stage: &str) -> Vec<GpuLoad> {
@@ -238,7 +243,7 @@ impl<'a> ViewStages<'a> {
         self.odd_photos.warn();
         let n = self.n_unrepresentable.load(Ordering::Relaxed);
         if n > 0 {
-            let is_on_gpu = self.tools.scene.gpus().is_some();
+            let is_on_gpu = self.tools.scene.views_on_gpus().is_some();
             let advice =
                 if is_on_gpu { "; on a GPU without f64, --device cpu draws more of them" } else { "" };
             tracing::warn!(
@@ -255,59 +260,72 @@ impl<'a> ViewStages<'a> {
                 Some(photos) if !photos.fetch(view)? => return Ok(None),
                 _ => Next::Decode,
             },
-            Next::Decode => match self.decode(view)? {
-                photo if self.tools.segmenter.wants_depth() => Next::Depth(photo),
-                photo => Next::Segment(photo),
-            },
-            Next::Depth(photo) => Next::Segment(self.add_depth(view, photo)?),
-            Next::Segment(photo) => Next::Crop(self.segment(view, photo)?),
-            Next::Crop(segmented) => Next::Embed(self.crop(view, segmented)?),
-            Next::Embed(cropped) => Next::Raster(self.embed(view, cropped)?),
-            Next::Raster(embedded) => Next::Write(self.lift(view, embedded)?),
-            Next::Write(lifted) => {
-                self.write(view, &lifted, work.secs)?;
+            Next::Decode => {
+                let loaded = ingest::load_image(view)?;
+                self.odd_photos.add(&loaded);
+                match self.tools.segmenter.wants_depth() {
+                    true => Next::Depth(loaded),
+                    false => Next::Segment(loaded, None),
+                }
+            }
+            Next::Depth(loaded) => {
+                let depth = self.depth(view, &loaded)?;
+                Next::Segment(loaded, Some(depth))
+            }
+            Next::Segment(loaded, depth) => {
+                let masks = self.segment(view, &loaded, depth.as_deref())?;
+                Next::Crop(loaded, masks)
+            }
+            Next::Crop(loaded, masks) => Next::Embed(self.crop(view, loaded, masks)?),
+            Next::Embed(cropped) => {
+                let Cropped { crops, windows, patches, partition } = cropped;
+                Next::Raster(self.embed(view, crops, windows, patches)?, partition)
+            }
+            Next::Raster(vectors, partition) => self.lift(view, vectors, partition)?,
+            Next::Write(contributions, outlines, raster_width_px) => {
+                self.tools.sink.check_unchanged(view, self.tools.segmenter)?;
+                let record = ViewRecord { raster_width_px, secs: work.secs };
+                self.tools.sink.keep(view, &contributions, &outlines, record)?;
+                self.tools.context.progress.advance(1);
                 return Ok(None);
             }
         };
         Ok(Some(Work { view, next, secs: work.secs + start.elapsed().as_secs_f32() }))
     }
 
-    fn decode(&self, view: &View) -> Result<Photo, EncodeError> {
-        let loaded = ingest::load_image(view)?;
-        self.odd_photos.add(&loaded);
-        Ok(Photo { loaded, depth: None })
-    }
-
-    fn add_depth(&self, view: &View, photo: Photo) -> Result<Photo, EncodeError> {
-        let loaded = photo.loaded;
+    fn depth(&self, view: &View, loaded: &LoadedImage) -> Result<Vec<f32>, EncodeError> {
         let width = self.tools.settings.raster_width;
-        let raster_view = raster_view(&loaded, width.px(loaded.view.intrinsics.width_px));
+        let raster_view = raster_view(loaded, width.px(loaded.view.intrinsics.width_px));
         // A GPU waits for colours that these threads compute, rather than they for it.
         let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
         let drawing = self
+            .tools
             .context
             .install(draw)
             .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
         // Holes of the scene have no depth.
         let seen = drawing.depth.iter().zip(&drawing.coverage);
         let seen: Vec<f32> = seen.map(|(depth, share)| if *share > 0.5 { *depth } else { 0.0 }).collect();
-        let depth = enlarge(&seen, &raster_view, &loaded);
-        Ok(Photo { loaded, depth: Some(depth) })
+        Ok(enlarge(&seen, &raster_view, loaded))
     }
 
-    fn segment(&self, view: &View, Photo { loaded, depth }: Photo) -> Result<Segmented, EncodeError> {
-        let pool = Some(&self.context.workers.shared);
-        let input = SegmentInput { pool, ..SegmentInput::new(&loaded, depth.as_deref()) };
+    fn segment(
+        &self,
+        view: &View,
+        loaded: &LoadedImage,
+        depth: Option<&[f32]>,
+    ) -> Result<Vec<Mask>, EncodeError> {
+        let pool = Some(&self.tools.context.workers.shared);
+        let input = SegmentInput { pool, ..SegmentInput::new(loaded, depth) };
         let mut masks = self.tools.segmenter.segment(&input)?;
         let min_mask_px = self.tools.settings.min_mask_px;
         masks.retain(|mask| mask.level == Mask::STANDING || mask.area_px >= min_mask_px);
         let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
-        self.context.progress.segmented(&view.name, masks.len(), &draw);
-        Ok(Segmented { loaded, masks })
+        self.tools.context.progress.segmented(&view.name, masks.len(), &draw);
+        Ok(masks)
     }
 
-    fn crop(&self, view: &View, segmented: Segmented) -> Result<Cropped, EncodeError> {
-        let Segmented { loaded, mut masks } = segmented;
+    fn crop(&self, view: &View, loaded: LoadedImage, mut masks: Vec<Mask>) -> Result<Cropped, EncodeError> {
         let (patches, regions) = self.patches(&loaded.image, &masks);
         let partition = self.partition(&loaded, regions.as_ref().unwrap_or(&masks));
         let windows = self.windows(&loaded.image, &masks).map(|windows| {
@@ -367,8 +385,14 @@ impl<'a> ViewStages<'a> {
         Partition { raster_view, regions, masks_of_region, outlines }
     }
 
-    fn embed(&self, view: &View, cropped: Cropped) -> Result<Embedded, EncodeError> {
-        let Cropped { crops, windows, patches, partition } = cropped;
+    /// Returns `[n_masks][dim]`, unit.
+    fn embed(
+        &self,
+        view: &View,
+        crops: Crops,
+        windows: Option<Surroundings>,
+        patches: Option<(Arc<RgbImage>, PatchUse)>,
+    ) -> Result<Vec<f32>, EncodeError> {
         let failed = |source| EncodeError::Embed { view: view.name.clone(), source };
         let mut vectors = match (&self.encoders, crops) {
             (_, Crops::Squares(crops)) if crops.is_empty() => Vec::new(),
@@ -395,7 +419,7 @@ impl<'a> ViewStages<'a> {
             let of_windows = vectors.split_off(windows.n_masks() * dim);
             windows.mix(&mut vectors, &of_windows, dim);
         }
-        Ok(Embedded { vectors, partition })
+        Ok(vectors)
     }
 
     fn with_encoder<T>(&self, work: impl FnOnce(&mut dyn ImageEncoder) -> T) -> Result<T, ModelError> {
@@ -414,7 +438,7 @@ impl<'a> ViewStages<'a> {
         Ok(result)
     }
 
-    fn lift(&self, view: &View, Embedded { vectors, partition }: Embedded) -> Result<Lifted, EncodeError> {
+    fn lift(&self, view: &View, vectors: Vec<f32>, partition: Partition) -> Result<Next, EncodeError> {
         let Partition { raster_view, regions, masks_of_region, outlines } = partition;
         let ViewTools { engines, scene, split, .. } = self.tools;
         let weights = scene
@@ -424,15 +448,7 @@ impl<'a> ViewStages<'a> {
         self.n_unrepresentable.fetch_max(n_unrepresentable, Ordering::Relaxed);
         let dim = engines.models.dim();
         let contributions = ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, split);
-        Ok(Lifted { contributions, outlines, raster_width_px: raster_view.intrinsics.width_px })
-    }
-
-    fn write(&self, view: &View, lifted: &Lifted, secs: f32) -> Result<(), EncodeError> {
-        let record = ViewRecord { raster_width_px: lifted.raster_width_px, secs };
-        self.tools.sink.check_unchanged(view, self.tools.segmenter)?;
-        self.tools.sink.keep(view, &lifted.contributions, &lifted.outlines, record)?;
-        self.context.progress.advance(1);
-        Ok(())
+        Ok(Next::Write(contributions, outlines, raster_view.intrinsics.width_px))
     }
 }
 

@@ -8,15 +8,13 @@ use rayon::prelude::*;
 use slag_common::{Hash32, durable};
 
 use super::documents::{self, FailedView};
-use super::error::FleetError;
 use super::heartbeat::Heartbeat;
-use super::inputs;
-use super::objects::ViewObject;
 use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
+use super::{FleetError, objects, prepared};
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, RunContext, ViewRecord, ViewsRun};
+use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, ViewRecord, ViewsRun};
 use crate::encode::{EncodeError, Engines, SkippedView};
 
 pub(crate) struct Coordinator {
@@ -36,11 +34,10 @@ impl Coordinator {
         &self,
         plan: &Plan<'_>,
         done: &BTreeMap<String, ViewRecord>,
-        context: &RunContext<'_>,
     ) -> Result<ViewsInWork<'_>, FleetError> {
         let is_open = |view: &usize| !done.contains_key(&plan.inputs.views[*view].name);
         let open: Vec<usize> = plan.order.iter().copied().filter(is_open).collect();
-        let run_plan = inputs::upload(&self.bucket, plan, &open, context)?;
+        let run_plan = prepared::upload(&self.bucket, plan, &open)?;
         let run = Run::begin(&self.bucket, &run_plan)?;
         let open_queue = |queue| Enqueuer::open(&self.bucket.runtime, queue, run, run_plan.of_scene);
         let queue = self.queue.as_ref().map(open_queue).transpose()?;
@@ -66,13 +63,12 @@ impl Executor for Coordinator {
         &self,
         plan: &Plan<'_>,
         done: &BTreeMap<String, ViewRecord>,
-        context: &RunContext<'_>,
     ) -> Result<ViewsRun, EncodeError> {
-        let mut views = self.begin(plan, done, context)?;
+        let mut views = self.begin(plan, done)?;
         while !views.open.is_empty() {
-            let n_fetched = views.fetch_done(plan, context)?;
+            let n_fetched = views.fetch_done(plan)?;
             views.take_failed(plan.settings.run.strict)?;
-            if context.is_cancelled() {
+            if plan.context.is_cancelled() {
                 let n_done = plan.job.done_views()?.len();
                 return Err(EncodeError::Interrupted { n_done, n_views: plan.order.len() });
             }
@@ -103,17 +99,17 @@ struct ViewsInWork<'a> {
 
 impl ViewsInWork<'_> {
     /// Downloads finished views into this machine's job; returns their number.
-    fn fetch_done(&mut self, plan: &Plan<'_>, context: &RunContext<'_>) -> Result<usize, FleetError> {
+    fn fetch_done(&mut self, plan: &Plan<'_>) -> Result<usize, FleetError> {
         let names = self.bucket.list("views")?;
         let there: BTreeSet<Hash32> = names.iter().filter_map(|name| name.parse().ok()).collect();
         let fresh: Vec<(&Hash32, &(usize, String))> =
             self.open.iter().filter(|(id, _)| there.contains(id)).collect();
         let fetch = |(id, (_, name)): &(&Hash32, &(usize, String))| {
             self.fetch_view(plan, **id, name)?;
-            context.progress.advance(1);
+            plan.context.progress.advance(1);
             Ok::<_, FleetError>(())
         };
-        context.install(|| fresh.par_iter().try_for_each(fetch))?;
+        plan.context.install(|| fresh.par_iter().try_for_each(fetch))?;
         let n_fresh = fresh.len();
         self.open.retain(|id, _| !there.contains(id));
         Ok(n_fresh)
@@ -122,10 +118,11 @@ impl ViewsInWork<'_> {
     fn fetch_view(&self, plan: &Plan<'_>, id: Hash32, name: &str) -> Result<(), FleetError> {
         let key = documents::view_key(id);
         let bytes = self.bucket.require(&key)?;
-        let view = ViewObject::read(&bytes).map_err(|e| FleetError::damaged(self.bucket, &key, e))?;
-        durable::write(&plan.job.outlines_path(name), view.outlines())?;
-        durable::write(&plan.job.contributions_path(name), view.contributions())?;
-        Ok(plan.job.mark_done(name, view.record)?)
+        let (record, outlines, contributions) =
+            objects::unpack_view(&bytes).map_err(|e| FleetError::damaged(self.bucket, &key, e))?;
+        durable::write(&plan.job.outlines_path(name), &outlines)?;
+        durable::write(&plan.job.contributions_path(name), &contributions)?;
+        Ok(plan.job.mark_done(name, record)?)
     }
 
     /// Leaves out views that workers could not do; with `is_strict`, fails at the first.
@@ -139,7 +136,7 @@ impl ViewsInWork<'_> {
             let FailedView { reason } = documents::parse(self.bucket, &key, &self.bucket.require(&key)?)?;
             let Some((_, view)) = self.open.remove(&id) else { continue };
             if is_strict {
-                return Err(FleetError::View { view, reason });
+                return Err(FleetError::Failed(format!("view {view}: {reason}")));
             }
             self.skipped.push(view, reason);
         }

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::error::FleetError;
+use super::FleetError;
 
 /// Returns the open views' indices, in the order in which to begin them.
 pub(super) type OpenViews<'a> = &'a mut dyn FnMut() -> Result<Vec<usize>, FleetError>;

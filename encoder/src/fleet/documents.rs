@@ -5,7 +5,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use slag_common::{Hash32, Intrinsics};
 
-use super::error::FleetError;
+use super::FleetError;
 use crate::blobs::Bucket;
 use crate::cells::CellLimits;
 use crate::encode::ViewSettings;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
-use super::error::FleetError;
+use super::FleetError;
 use super::run::Run;
 use crate::blobs::Bucket;
 
@@ -55,7 +55,7 @@ impl HeartbeatWatch {
     /// Checks for a new beat, if it is time.
     ///
     /// # Errors
-    /// [`FleetError::Abandoned`]; [`FleetError::Blob`].
+    /// [`FleetError::Failed`] after too long a silence; [`FleetError::Blob`].
     pub(super) fn check(&mut self, bucket: &Bucket) -> Result<(), FleetError> {
         if self.looked.is_some_and(|looked| looked.elapsed() < BEAT.min(self.patience)) {
             return Ok(());
@@ -71,8 +71,13 @@ impl HeartbeatWatch {
         if silence < self.patience {
             return Ok(());
         }
-        let (run, url) = (self.run.0, bucket.url.clone());
-        Err(FleetError::Abandoned { run, secs: silence.as_secs(), url })
+        Err(FleetError::Failed(format!(
+            "run {}: its coordinator has shown no heartbeat for {} s. What is done lies in {}: start the same encode again, \
+             then its workers",
+            self.run.0,
+            silence.as_secs(),
+            bucket.url
+        )))
     }
 }
 

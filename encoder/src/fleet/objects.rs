@@ -1,8 +1,6 @@
 //! The binary objects in a bucket: the scene, with the columns that an encode reads, in the world of the poses,
 //! and what a view leaves.
 
-use std::ops::Range;
-
 use slag_common::Gaussians;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
@@ -25,33 +23,16 @@ pub(super) fn pack_view(
     Ok(bytes)
 }
 
-pub(super) struct ViewObject {
-    bytes: AlignedBytes,
-    pub(super) record: ViewRecord,
-    outlines: Range<usize>,
-    contributions: Range<usize>,
-}
-
-impl ViewObject {
-    pub(super) fn read(bytes: &[u8]) -> Result<Self, ContainerError> {
-        let bytes = AlignedBytes::copy_of(bytes);
-        let layout = Layout::check(&bytes, VIEW_MAGIC, VERSION)?;
-        let find = |id: u32, name| layout.find(id).ok_or(ContainerError::Missing { id, name });
-        let [record, outlines, contributions] =
-            [find(1, "record")?, find(2, "outlines")?, find(3, "contributions")?];
-        let offset_bytes = record.start as u64;
-        let damaged = |e: serde_json::Error| ContainerError::Damaged { offset_bytes, what: e.to_string() };
-        let record = serde_json::from_slice(&bytes[record]).map_err(damaged)?;
-        Ok(Self { bytes, record, outlines, contributions })
-    }
-
-    pub(super) fn outlines(&self) -> &[u8] {
-        &self.bytes[self.outlines.clone()]
-    }
-
-    pub(super) fn contributions(&self) -> &[u8] {
-        &self.bytes[self.contributions.clone()]
-    }
+/// A view's record, outlines and contributions.
+pub(super) fn unpack_view(bytes: &[u8]) -> Result<(ViewRecord, Vec<u8>, Vec<u8>), ContainerError> {
+    let bytes = AlignedBytes::copy_of(bytes);
+    let layout = Layout::check(&bytes, VIEW_MAGIC, VERSION)?;
+    let find = |id: u32, name| layout.find(id).ok_or(ContainerError::Missing { id, name });
+    let record = find(1, "record")?;
+    let offset_bytes = record.start as u64;
+    let damaged = |e: serde_json::Error| ContainerError::Damaged { offset_bytes, what: e.to_string() };
+    let record = serde_json::from_slice(&bytes[record]).map_err(damaged)?;
+    Ok((record, bytes[find(2, "outlines")?].to_vec(), bytes[find(3, "contributions")?].to_vec()))
 }
 
 /// Leaves out coefficients of higher degree, which an encode does not read.

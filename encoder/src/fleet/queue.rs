@@ -18,8 +18,8 @@ use futures_util::StreamExt;
 use slag_common::Hash32;
 use tokio::runtime::Runtime;
 
+use super::FleetError;
 use super::dispatch::{Dispatcher, OpenViews};
-use super::error::FleetError;
 use super::run::Run;
 
 const CONSUMER: &str = "workers";
@@ -48,8 +48,12 @@ pub(crate) struct QueueSettings {
 
 impl QueueSettings {
     async fn connect(&self) -> Result<Context, FleetError> {
-        let refuse =
-            |problem: &dyn Display| FleetError::Queue { url: self.url.clone(), problem: problem.to_string() };
+        let refuse = |problem: &dyn Display| {
+            FleetError::Failed(format!(
+                "{}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials",
+                self.url
+            ))
+        };
         let mut options = ConnectOptions::new().name("slag-encoder");
         if let Some(path) = &self.credentials {
             options = options.credentials_file(path).await.map_err(|e| refuse(&e))?;
@@ -283,10 +287,7 @@ async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliv
                 (_, None) => return,
             }
         }
-        match is_sound {
-            true => consumer = Some(open),
-            false => tokio::time::sleep(RETRY_PAUSE).await,
-        }
+        if is_sound { consumer = Some(open) } else { tokio::time::sleep(RETRY_PAUSE).await }
     }
 }
 

@@ -2,8 +2,8 @@
 //! coordinator's word that it publishes, or by that of the next run's coordinator. Both put the same object on
 //! condition that it is not there, so one put decides whether a run is published.
 
+use super::FleetError;
 use super::documents::{self, End, PlannedBy, RunPlan};
-use super::error::FleetError;
 use crate::blobs::Bucket;
 
 /// Keys of a run: how it ended; all its views are done.
@@ -74,7 +74,11 @@ impl Run {
         let PlannedBy { program: planned } = documents::parse(bucket, &key, &bytes)?;
         let own = documents::own_version();
         if planned != own {
-            return Err(FleetError::Version { run: run.0, planned, own });
+            return Err(FleetError::Failed(format!(
+                "run {} was planned by slag-encoder {planned}, this is {own}: install the same program on all machines of the \
+                 fleet",
+                run.0
+            )));
         }
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }
@@ -107,10 +111,7 @@ impl Run {
     }
 
     pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
-        match self.has_ended(bucket)? {
-            true => Err(self.superseded(bucket)),
-            false => Ok(()),
-        }
+        if self.has_ended(bucket)? { Err(self.superseded(bucket)) } else { Ok(()) }
     }
 
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {

@@ -6,9 +6,8 @@ use slag_common::View;
 
 use super::dispatch::Dispatcher;
 use super::documents::{self, FailedView};
-use super::error::FleetError;
-use super::objects;
-use super::prepared::{Prepared, of_encode};
+use super::prepared::Prepared;
+use super::{FleetError, objects};
 use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{
     PhotoSource, RunContext, ViewRecord, ViewSink, ViewStages, ViewTools, work_off,
@@ -23,6 +22,7 @@ use crate::segment::Segmenter;
 const N_AT_ONCE: usize = 2;
 
 pub(super) struct ViewWork<'a> {
+    pub(super) context: &'a RunContext<'a>,
     pub(super) bucket: &'a Bucket,
     pub(super) prepared: &'a Prepared,
     pub(super) engines: &'a Engines<'a>,
@@ -37,6 +37,7 @@ pub(super) struct ViewWork<'a> {
 impl ViewWork<'_> {
     pub(super) fn tools(&self) -> ViewTools<'_> {
         ViewTools {
+            context: self.context,
             engines: self.engines,
             settings: &self.prepared.settings,
             n_threads: self.n_threads,
@@ -50,30 +51,30 @@ impl ViewWork<'_> {
     }
 
     /// Does the available views; ends when there are none at present.
-    pub(super) fn run(&self, context: &RunContext<'_>) -> Result<(), FleetError> {
+    pub(super) fn run(&self) -> Result<(), FleetError> {
         let prepared = self.prepared;
-        let stages = ViewStages::new(self.tools(), context);
-        let source = views_to_do(self.dispatcher, &prepared.views, || context.is_cancelled());
+        let stages = ViewStages::new(self.tools());
+        let source = views_to_do(self.dispatcher, &prepared.views, || self.context.is_cancelled());
         let source = source.map(|view| (true, view));
-        let reports = work_off(&stages, self.n_threads, source, context, |view, error| {
+        work_off(&stages, source, |view, error| {
             // The coordinator warns of the first few.
             tracing::info!("view {} fails: {error}", view.name);
             Ok(self.fail(view, &error.to_string())?)
-        });
-        reports.map(drop).map_err(of_encode)
+        })?;
+        Ok(())
     }
 
     fn fail(&self, view: &View, reason: &str) -> Result<(), FleetError> {
         let number = self.prepared.number_of[&view.name];
         let document = documents::to_bytes(&FailedView { reason: reason.to_owned() })?;
         self.bucket.put_new(&self.prepared.run.failed_key(number), document)?;
-        self.finish(view);
+        self.finish(number);
         Ok(())
     }
 
-    fn finish(&self, view: &View) {
-        self.prepared.files.remove(view);
-        self.dispatcher.done(self.prepared.number_of[&view.name]);
+    fn finish(&self, number: usize) {
+        self.prepared.remove_view(number);
+        self.dispatcher.done(number);
     }
 }
 
@@ -90,7 +91,7 @@ impl PhotoSource for ViewWork<'_> {
             self.dispatcher.done(number);
             return Ok(false);
         }
-        self.prepared.files.fetch(view)?;
+        self.prepared.fetch_view(self.bucket, number)?;
         Ok(true)
     }
 }
@@ -109,12 +110,13 @@ impl ViewSink for ViewWork<'_> {
     ) -> Result<(), EncodeError> {
         let contributions = contributions.to_bytes(&view.image_path)?;
         let bytes = objects::pack_view(record, &outlines_to_bytes(outlines)?, &contributions)?;
-        let id = self.prepared.plan.views[self.prepared.number_of[&view.name]].id;
+        let number = self.prepared.number_of[&view.name];
+        let id = self.prepared.plan.views[number].id;
         // If another worker was first, its object has the same content.
         if self.bucket.put_new(&documents::view_key(id), bytes)? {
             self.n_done.fetch_add(1, Ordering::Relaxed);
         }
-        self.finish(view);
+        self.finish(number);
         Ok(())
     }
 }

@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use super::FleetError;
 use super::dispatch::{Dispatcher, Share};
 use super::documents::{self, FailedView, RunPlan};
-use super::error::FleetError;
 use super::heartbeat::HeartbeatWatch;
 use super::prepared::Prepared;
 use super::queue::{Queue, QueueSettings};
@@ -89,8 +89,11 @@ pub(crate) fn work(
         }
     }
     if report == WorkReport::default() && !context.is_cancelled() && Run::is_first(bucket)? {
-        let (url, secs) = (bucket.url.clone(), settings.patience.as_secs_f64());
-        return Err(FleetError::NoRun { url, secs });
+        return Err(FleetError::Failed(format!(
+            "{}: no encode began within {:.0} s; check --blobs, or wait longer with --wait",
+            bucket.url,
+            settings.patience.as_secs_f64()
+        )));
     }
     Ok(report)
 }
@@ -117,6 +120,7 @@ fn work_for(
     };
     let scene = context.install(|| engines.rasterizer.load(&prepared.scene)).map_err(EncodeError::from)?;
     let work = ViewWork {
+        context,
         bucket,
         prepared: &prepared,
         engines,
@@ -128,20 +132,16 @@ fn work_for(
         n_done: AtomicUsize::new(0),
     };
     prepared.check_memory(settings.memory_bytes, &work.tools())?;
-    let result = while_open(&work, HeartbeatWatch::new(run, settings.patience), context);
+    let result = while_open(&work, HeartbeatWatch::new(run, settings.patience));
     report.n_views += work.n_done.load(Ordering::Relaxed);
     result
 }
 
-fn while_open(
-    work: &ViewWork<'_>,
-    mut coordinator: HeartbeatWatch,
-    context: &RunContext<'_>,
-) -> Result<(), FleetError> {
-    let ViewWork { bucket, dispatcher, prepared, .. } = *work;
+fn while_open(work: &ViewWork<'_>, mut coordinator: HeartbeatWatch) -> Result<(), FleetError> {
+    let ViewWork { context, bucket, dispatcher, prepared, .. } = *work;
     loop {
         dispatcher.offer(&mut || open_views(bucket, prepared))?;
-        work.run(context)?;
+        work.run()?;
         loop {
             record_failures(bucket, prepared.run, dispatcher)?;
             if context.is_cancelled() || !prepared.run.is_open(bucket)? {

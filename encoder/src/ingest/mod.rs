@@ -1,8 +1,6 @@
 //! Ingest: loads photos as ideal pinhole images of known size.
 
-mod geo;
 mod splat_frame;
-mod undistort;
 
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
@@ -14,10 +12,8 @@ use serde::Deserialize;
 use slag_common::photo::{self, PhotoError};
 use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View, files};
 
-pub use geo::{GeoError, read_geo_reference};
-pub use splat_frame::{Activated, FrameChoice, to_poses};
+pub use splat_frame::{Activated, FrameChoice, GeoError, read_geo_reference, to_poses};
 pub(crate) use splat_frame::{FoundFrame, find_frame};
-pub use undistort::Undistorter;
 
 /// Largest factor by which photos may be downscaled from the size in the intrinsics.
 const MAX_DOWNSCALE: u32 = 64;
@@ -90,17 +86,8 @@ pub enum IngestError {
     Io(#[from] io::Error),
     #[error("{}: {fault}", path.display())]
     Photo { path: PathBuf, fault: PhotoError },
-    #[error(
-        "{}: nothing of it is seen: it is transparent, or the camera's lens distortion leaves no pixel; give another \
-         copy, or leave the photo out",
-        path.display()
-    )]
-    Blank { path: PathBuf },
-    #[error(
-        "{}: {} x {} px take {needed} while they are loaded, and {free} are free; give smaller copies",
-        path.display(), size_px[0], size_px[1]
-    )]
-    TooLarge { path: PathBuf, size_px: [u32; 2], needed: ByteSize, free: ByteSize },
+    #[error("{}: {problem}", path.display())]
+    File { path: PathBuf, problem: String },
     #[error(
         "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other, 1/{MAX_DOWNSCALE} to {MAX_UPSCALE}; \
          give the images that the poses were computed from, or whole-factor reductions of them",
@@ -153,8 +140,12 @@ pub fn check_memory(view: &View, free_bytes: u64) -> Result<(), IngestError> {
     if needed_bytes <= free_bytes {
         return Ok(());
     }
-    let (path, size_px) = (view.image_path.clone(), photo_size_px(view));
-    Err(IngestError::TooLarge { path, size_px, needed: ByteSize(needed_bytes), free: ByteSize(free_bytes) })
+    let ([width_px, height_px], needed, free) =
+        (photo_size_px(view), ByteSize(needed_bytes), ByteSize(free_bytes));
+    let problem = format!(
+        "{width_px} x {height_px} px take {needed} while they are loaded, and {free} are free; give smaller copies"
+    );
+    Err(IngestError::File { path: view.image_path.clone(), problem })
 }
 
 /// Loads the photo of a view and undistorts it.
@@ -169,7 +160,9 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
     let or_blank = |loaded: LoadedImage| match &loaded.valid {
         Some(valid) if !valid.contains(&true) => {
-            Err(IngestError::Blank { path: loaded.view.image_path.clone() })
+            let problem = "nothing of it is seen: it is transparent, or the camera's lens distortion leaves no pixel; give \
+                           another copy, or leave the photo out";
+            Err(IngestError::File { path: loaded.view.image_path.clone(), problem: problem.into() })
         }
         _ => Ok(loaded),
     };
@@ -232,4 +225,84 @@ fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
         && (proportional
             || (2..=MAX_DOWNSCALE)
                 .any(|n| reduced(width_px, camera.width_px, n) && reduced(height_px, camera.height_px, n)))
+}
+
+/// Mapping from a camera with distortion to the ideal pinhole of equal focal lengths, centre and size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Undistorter {
+    /// At the size of the image.
+    camera: Intrinsics,
+    /// Normalised radius beyond which the lens polynomial is no longer monotonic.
+    max_radius: f64,
+}
+
+impl Undistorter {
+    /// `camera` must have the size of the images.
+    pub fn new(camera: Intrinsics) -> Self {
+        Self { camera, max_radius: camera.distortion.monotonic_radius() }
+    }
+
+    /// Position of an ideal pixel's centre in the distorted image, pixels; `None` outside the image or the lens model.
+    fn source_px(&self, column: u32, row: u32) -> Option<[f64; 2]> {
+        let ideal = self.camera.distorted_from_pixel([f64::from(column) + 0.5, f64::from(row) + 0.5]);
+        if ideal[0].hypot(ideal[1]) > self.max_radius || self.camera.distortion.folds_at(ideal) {
+            return None;
+        }
+        let [u, v] = self.camera.pixel_from_distorted(self.camera.distort(ideal));
+        let inside = (0.0..f64::from(self.camera.width_px)).contains(&u)
+            && (0.0..f64::from(self.camera.height_px)).contains(&v);
+        inside.then_some([u, v])
+    }
+
+    /// Ideal image, bilinear, black outside the photo, and whether each pixel (row-major) is inside.
+    pub fn image(&self, photo: &RgbImage) -> (RgbImage, Vec<bool>) {
+        let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
+        assert_eq!(photo.dimensions(), (width_px, height_px), "the undistorter is of another size");
+        let mut valid = Vec::with_capacity(width_px as usize * height_px as usize);
+        let mut ideal = RgbImage::new(width_px, height_px);
+        for (column, row, pixel) in ideal.enumerate_pixels_mut() {
+            let source = self.source_px(column, row);
+            valid.push(source.is_some());
+            if let Some(source) = source {
+                pixel.0 = bilinear(photo, source);
+            }
+        }
+        (ideal, valid)
+    }
+
+    /// Maps labels (row-major) to the ideal image, nearest neighbour; pixels outside the photo get `outside`.
+    pub fn labels(&self, labels: &[u32], outside: u32) -> Vec<u32> {
+        let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
+        assert_eq!(
+            labels.len(),
+            width_px as usize * height_px as usize,
+            "the undistorter is of another size"
+        );
+        let mut ideal = Vec::with_capacity(labels.len());
+        for row in 0..height_px {
+            ideal.extend((0..width_px).map(|column| match self.source_px(column, row) {
+                // Truncation is correct: pixel i spans i..i + 1.
+                Some([u, v]) => labels[v as usize * width_px as usize + u as usize],
+                None => outside,
+            }));
+        }
+        ideal
+    }
+}
+
+/// Bilinear colour at a position in pixels; within half a pixel of the border, that of the edge.
+fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> [u8; 3] {
+    let axis = |position: f64, size_px: u32| {
+        let from_centre = (position - 0.5).clamp(0.0, f64::from(size_px - 1));
+        let low = from_centre as u32;
+        (low, (low + 1).min(size_px - 1), from_centre - f64::from(low))
+    };
+    let (x0, x1, fx) = axis(u, image.width());
+    let (y0, y1, fy) = axis(v, image.height());
+    let [a, b, c, d] = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| image.get_pixel(x, y).0);
+    [0, 1, 2].map(|channel| {
+        let [a, b, c, d] = [a, b, c, d].map(|colour| f64::from(colour[channel]));
+        let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
+        (top + (bottom - top) * fy).round() as u8
+    })
 }

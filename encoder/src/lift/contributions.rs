@@ -26,15 +26,8 @@ pub(crate) const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
 pub(crate) const MAX_IN_ALL: usize = u32::MAX as usize - 1;
 pub(crate) const MAX_REGIONS: usize = 1 << REGION_BITS;
 
-mod section {
-    pub(crate) const HEADER: u32 = 1;
-    pub(crate) const REGION_STARTS: u32 = 2;
-    pub(crate) const REGION_MASKS: u32 = 3;
-    pub(crate) const MASK_VECTORS: u32 = 4;
-    pub(crate) const RUNS: u32 = 5;
-    /// After the container; errors name the section by this number.
-    pub(crate) const ENTRIES: u32 = 6;
-}
+/// Number of the section after the container, for errors.
+const ENTRIES: u32 = 6;
 
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
@@ -118,6 +111,13 @@ pub enum ContributionError {
     TooManyRegions { path: PathBuf, found: usize },
 }
 
+impl ContributionError {
+    pub(super) fn damaged(path: &Path, what: String) -> Self {
+        let source = ContainerError::Damaged { offset_bytes: 0, what };
+        Self::Damaged { path: path.to_owned(), source }
+    }
+}
+
 /// CRC-32: for a gigabyte per scene a cryptographic hash would be the lift's slowest step. Storage and network have
 /// checksums of their own.
 fn checksum(entries: &[PackedEntry]) -> u64 {
@@ -192,11 +192,11 @@ impl ViewContributions {
             n_entries: entries.len() as u64,
         };
         let sections = [
-            (section::HEADER, bytemuck::bytes_of(&header)),
-            (section::REGION_STARTS, container::bytes_of(&region_starts)),
-            (section::REGION_MASKS, container::bytes_of(&region_masks)),
-            (section::MASK_VECTORS, container::bytes_of(&self.mask_vectors)),
-            (section::RUNS, container::bytes_of(&runs)),
+            (1, bytemuck::bytes_of(&header)),
+            (2, container::bytes_of(&region_starts)),
+            (3, container::bytes_of(&region_masks)),
+            (4, container::bytes_of(&self.mask_vectors)),
+            (5, container::bytes_of(&runs)),
         ];
         let mut bytes = Vec::new();
         container::write(&mut bytes, MAGIC, VERSION, &sections)?;
@@ -209,8 +209,8 @@ impl ViewContributions {
 #[derive(Clone, Debug)]
 pub struct ContributionFile {
     pub(super) path: PathBuf,
-    pub(super) n_regions: usize,
-    pub(super) n_entries: u64,
+    pub(crate) n_regions: usize,
+    pub(crate) n_entries: u64,
     entries_at_bytes: u64,
     /// By (cell, slice), ascending.
     pub runs: Vec<Run>,
@@ -298,7 +298,7 @@ impl ContributionFile {
         let offset_bytes = self.offset_bytes(start);
         let found = checksum(entries);
         if found != expected {
-            let id = section::ENTRIES;
+            let id = ENTRIES;
             return Err(damaged(ContainerError::Checksum { id, offset_bytes, expected, found }));
         }
         let usable = |e: &PackedEntry| (e.region() as usize) < self.n_regions && e.weight.is_finite();
@@ -312,14 +312,14 @@ impl ContributionFile {
 
 fn parse(bytes: &[u8]) -> Result<(Header, ViewRegions, Vec<Run>), ContainerError> {
     let layout = Layout::check(bytes, MAGIC, VERSION)?;
-    let header: Header = layout.value(bytes, section::HEADER, "header")?;
+    let header: Header = layout.value(bytes, 1, "header")?;
     let (n_regions, n_masks, dim) = (header.n_regions as usize, header.n_masks as usize, header.dim as usize);
-    let starts: Vec<u32> = layout.values(bytes, section::REGION_STARTS, "region starts", n_regions + 1)?;
+    let starts: Vec<u32> = layout.values(bytes, 2, "region starts", n_regions + 1)?;
     let n_listed = header.n_region_masks as usize;
-    let masks: Vec<u32> = layout.values(bytes, section::REGION_MASKS, "region masks", n_listed)?;
+    let masks: Vec<u32> = layout.values(bytes, 3, "region masks", n_listed)?;
     let n_components = n_masks.saturating_mul(dim);
-    let mask_vectors = layout.values(bytes, section::MASK_VECTORS, "mask vectors", n_components)?;
-    let runs: Vec<Run> = layout.values(bytes, section::RUNS, "runs", header.n_runs as usize)?;
+    let mask_vectors = layout.values(bytes, 4, "mask vectors", n_components)?;
+    let runs: Vec<Run> = layout.values(bytes, 5, "runs", header.n_runs as usize)?;
     let consistent = dim > 0
         && starts.is_sorted()
         && starts[0] == 0

@@ -182,7 +182,7 @@ mod tests {
         for dim in [1, 7, 64, 130, 512] {
             let scene = scene_of(dim, 600, 11);
             let Scene { index, table, .. } = &scene;
-            let raw = index.read(0..index.parts().len()).expect("reads");
+            let raw = index.read(0..index.parts.len()).expect("reads");
             for contributions in index.transpose(&raw, table).expect("transposes") {
                 let results: Vec<(Vec<f32>, Vec<f32>)> = InstructionSet::available()
                     .iter()

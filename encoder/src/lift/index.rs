@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use rayon::prelude::*;
-use slag_common::container::ContainerError;
 
 use super::contributions::{ContributionError, ContributionFile, GAUSSIANS_PER_SLICE, PackedEntry, Run};
 use super::table::RegionTable;
@@ -74,22 +73,29 @@ impl PartContributions {
     pub(crate) fn entries_of(&self, k: usize) -> Range<usize> {
         self.starts[k] as usize..self.starts[k + 1] as usize
     }
+
+    /// Regions and weights of a Gaussian's entries.
+    pub(super) fn entries(&self, k: usize) -> impl Iterator<Item = (u32, f32)> {
+        let of = self.entries_of(k);
+        self.regions[of.clone()].iter().copied().zip(self.weights[of].iter().copied())
+    }
 }
 
 /// A view's file, and the position of its regions and runs in the scene.
 #[derive(Debug)]
-pub(super) struct IndexedView {
-    pub(super) file: ContributionFile,
+pub(crate) struct IndexedView {
+    pub(crate) file: ContributionFile,
     /// Slice of each run, ascending.
     pub(super) slices: Vec<u32>,
-    pub(super) first_region: u32,
-    pub(super) n_masks: usize,
+    pub(crate) first_region: u32,
+    pub(crate) n_masks: usize,
 }
 
 /// Ordered by the views' names.
 pub struct ContributionIndex {
-    pub(super) views: Vec<IndexedView>,
-    pub(super) parts: Vec<Part>,
+    pub(crate) views: Vec<IndexedView>,
+    /// Ascending by cell and within it.
+    pub parts: Vec<Part>,
     /// Gaussians of each slice: indices within its cell.
     pub(super) locals_of_slice: Vec<Range<usize>>,
     /// Transposed parts, if a pass has read them and the budget holds them.
@@ -114,31 +120,13 @@ impl ContributionIndex {
         Self::open_with(paths, dim, n_gaussians_of_cell, PART_ENTRIES)
     }
 
+    /// With parts of at most `part_entries`.
     pub(super) fn open_with(
         paths: &[PathBuf],
         dim: usize,
         n_gaussians_of_cell: &[usize],
         part_entries: u64,
     ) -> Result<(Self, RegionTable), ContributionError> {
-        let mut table = RegionTable::new(dim);
-        let mut files = Vec::with_capacity(paths.len());
-        for path in paths {
-            let (file, regions) = ContributionFile::open(path)?;
-            if regions.dim != dim {
-                return Err(of_another_scene(path));
-            }
-            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region())?;
-            files.push((file, first_region, regions.mask_vectors.len() / dim));
-        }
-        Ok((Self::of_files(files, n_gaussians_of_cell, part_entries)?, table))
-    }
-
-    /// Takes opened files, each with its first region and its number of masks.
-    pub(super) fn of_files(
-        files: Vec<(ContributionFile, u32, usize)>,
-        n_gaussians_of_cell: &[usize],
-        part_entries: u64,
-    ) -> Result<Self, ContributionError> {
         let mut first_slice_of_cell = vec![0];
         let mut locals_of_slice = Vec::new();
         for n in n_gaussians_of_cell {
@@ -146,21 +134,28 @@ impl ContributionIndex {
             locals_of_slice.extend(starts.map(|start| start..(start + GAUSSIANS_PER_SLICE).min(*n)));
             first_slice_of_cell.push(locals_of_slice.len());
         }
-        let mut views = Vec::with_capacity(files.len());
+        let mut table = RegionTable::new(dim);
+        let mut views = Vec::with_capacity(paths.len());
         let mut entries_of_slice = vec![0u64; locals_of_slice.len()];
-        for (file, first_region, n_masks) in files {
+        for path in paths {
+            let (file, regions) = ContributionFile::open(path)?;
+            if regions.dim != dim {
+                return Err(of_another_scene(path));
+            }
+            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region())?;
             let slices = file.runs.iter().map(|run| {
                 let of_cell = first_slice_of_cell.get(run.cell_id as usize..=run.cell_id as usize + 1)?;
                 let slice = of_cell[0] + run.slice as usize;
                 (slice < of_cell[1]).then_some(slice as u32)
             });
             let Some(slices) = slices.collect::<Option<Vec<u32>>>() else {
-                return Err(of_another_scene(&file.path));
+                return Err(of_another_scene(path));
             };
             for (run, slice) in slices.iter().enumerate() {
                 let range = file.entries_of_run(run);
                 entries_of_slice[*slice as usize] += range.end - range.start;
             }
+            let n_masks = regions.mask_vectors.len() / dim;
             views.push(IndexedView { file, slices, first_region, n_masks });
         }
         let parts = first_slice_of_cell
@@ -170,34 +165,11 @@ impl ContributionIndex {
                 cut_into_parts(cell as u32, w[0]..w[1], &entries_of_slice, &locals_of_slice, part_entries)
             })
             .collect();
-        let kept = OnceLock::new();
-        Ok(Self { views, parts, locals_of_slice, kept })
-    }
-
-    /// Ascending by cell and within it.
-    pub fn parts(&self) -> &[Part] {
-        &self.parts
+        Ok((Self { views, parts, locals_of_slice, kept: OnceLock::new() }, table))
     }
 
     pub fn n_entries(&self) -> u64 {
         self.parts.iter().map(|part| part.n_entries).sum()
-    }
-
-    /// First region of each view, ordered by name.
-    pub(crate) fn first_regions(&self) -> Vec<u32> {
-        self.views.iter().map(|view| view.first_region).collect()
-    }
-
-    pub(crate) fn n_masks_of_view(&self) -> impl Iterator<Item = usize> + '_ {
-        self.views.iter().map(|view| view.n_masks)
-    }
-
-    pub(crate) fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
-        self.views.iter().map(|view| view.file.n_regions)
-    }
-
-    pub(crate) fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
-        self.views.iter().map(|view| view.file.n_entries)
     }
 
     pub fn len_bytes(&self) -> u64 {
@@ -266,9 +238,7 @@ impl ContributionIndex {
 }
 
 fn of_another_scene(path: &Path) -> ContributionError {
-    let what = "the contributions belong to another scene or model".into();
-    let source = ContainerError::Damaged { offset_bytes: 0, what };
-    ContributionError::Damaged { path: path.to_owned(), source }
+    ContributionError::damaged(path, "the contributions belong to another scene or model".into())
 }
 
 fn part_bytes(part: &Part) -> u64 {
@@ -299,4 +269,104 @@ fn cut_into_parts(
         }
     }
     parts
+}
+
+struct SliceTask<'a> {
+    /// Numbers of views, and their entries.
+    runs: Vec<(usize, &'a [PackedEntry])>,
+    starts: &'a mut [u64],
+    first_entry: u64,
+    regions: &'a mut [u32],
+    weights: &'a mut [f32],
+    total_weights: &'a mut [f32],
+}
+
+impl ContributionIndex {
+    pub fn transpose(
+        &self,
+        raw: &RawGroup,
+        table: &RegionTable,
+    ) -> Result<Vec<PartContributions>, ContributionError> {
+        let first_slice = self.slices_of(&raw.parts).start;
+        let mut runs_of_slice = vec![Vec::new(); self.slices_of(&raw.parts).len()];
+        for (view, (runs, entries)) in raw.views.iter().enumerate() {
+            let of_view = &self.views[view];
+            let base = if runs.is_empty() { 0 } else { of_view.file.entries_of_run(runs.start).start };
+            for run in runs.clone() {
+                let range = of_view.file.entries_of_run(run);
+                let entries = &entries[(range.start - base) as usize..(range.end - base) as usize];
+                runs_of_slice[of_view.slices[run] as usize - first_slice].push((view, entries));
+            }
+        }
+        let mut contributions: Vec<PartContributions> =
+            self.parts[raw.parts.clone()].iter().map(PartContributions::zeroed).collect();
+        let mut tasks = Vec::with_capacity(runs_of_slice.len());
+        let mut runs_of_slice = runs_of_slice.into_iter();
+        for contributions in &mut contributions {
+            let (mut starts, mut totals) =
+                (&mut contributions.starts[1..], &mut contributions.total_weights[..]);
+            let (mut regions, mut weights) = (&mut contributions.regions[..], &mut contributions.weights[..]);
+            let mut first_entry = 0;
+            for slice in contributions.part.slices.clone() {
+                let runs = runs_of_slice.next().unwrap_or_default();
+                let n_entries: usize = runs.iter().map(|(_, entries)| entries.len()).sum();
+                let n = self.locals_of_slice[slice].len();
+                let task = SliceTask {
+                    runs,
+                    first_entry,
+                    starts: starts.split_off_mut(..n).unwrap_or_default(),
+                    regions: regions.split_off_mut(..n_entries).unwrap_or_default(),
+                    weights: weights.split_off_mut(..n_entries).unwrap_or_default(),
+                    total_weights: totals.split_off_mut(..n).unwrap_or_default(),
+                };
+                first_entry += n_entries as u64;
+                tasks.push(task);
+            }
+        }
+        let mask_counts = |view: &IndexedView| {
+            let first = view.first_region as usize;
+            table.mask_counts(first..first + view.file.n_regions)
+        };
+        let counts: Vec<Vec<f32>> = self.views.par_iter().map(mask_counts).collect();
+        tasks.into_par_iter().try_for_each(|task| self.transpose_slice(task, &counts))?;
+        Ok(contributions)
+    }
+
+    /// Counting sort by Gaussian that keeps the views' order.
+    fn transpose_slice(
+        &self,
+        task: SliceTask<'_>,
+        mask_counts: &[Vec<f32>],
+    ) -> Result<(), ContributionError> {
+        let mut next = [0u32; GAUSSIANS_PER_SLICE];
+        task.runs.iter().flat_map(|(_, entries)| *entries).for_each(|e| next[e.in_slice()] += 1);
+        let mut at = 0;
+        for (gaussian, next) in next.iter_mut().enumerate() {
+            let n = std::mem::replace(next, at);
+            at += n;
+            match task.starts.get_mut(gaussian) {
+                Some(end) => *end = task.first_entry + u64::from(at),
+                None if n == 0 => {}
+                None => {
+                    let what =
+                        format!("a contribution of Gaussian {gaussian} to a slice with fewer Gaussians");
+                    return Err(ContributionError::damaged(&self.views[task.runs[0].0].file.path, what));
+                }
+            }
+        }
+        let mut totals = [0.0f64; GAUSSIANS_PER_SLICE];
+        for (view, entries) in &task.runs {
+            let (first_region, counts) = (self.views[*view].first_region, &mask_counts[*view]);
+            for entry in *entries {
+                let at = &mut next[entry.in_slice()];
+                task.regions[*at as usize] = first_region + entry.region();
+                task.weights[*at as usize] = entry.weight;
+                *at += 1;
+                totals[entry.in_slice()] +=
+                    f64::from(entry.weight) * f64::from(counts[entry.region() as usize]);
+            }
+        }
+        task.total_weights.iter_mut().zip(totals).for_each(|(out, total)| *out = total as f32);
+        Ok(())
+    }
 }

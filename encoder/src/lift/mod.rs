@@ -14,17 +14,15 @@
 
 mod contributions;
 mod embeddings;
-mod field;
+pub mod field;
 mod index;
 mod passes;
 pub mod photos;
-pub mod published;
 pub(crate) mod refine;
 pub(crate) mod superpoint;
 mod table;
 #[cfg(test)]
 mod tests;
-mod transpose;
 
 pub use contributions::{Contribution, ContributionError, ContributionFile, ViewContributions};
 pub use field::CellField;

@@ -29,10 +29,7 @@ pub(crate) struct SceneContributions<'a> {
 
 impl SceneContributions<'_> {
     pub(crate) fn check_cancelled(&self) -> Result<(), ContributionError> {
-        match self.cancel.load(Ordering::Relaxed) {
-            true => Err(ContributionError::Cancelled),
-            false => Ok(()),
-        }
+        if self.cancel.load(Ordering::Relaxed) { Err(ContributionError::Cancelled) } else { Ok(()) }
     }
 
     /// Calls `work` for each part on all threads, and `merge` with the results in the order of parts.
@@ -97,7 +94,7 @@ impl ContributionIndex {
                 // Half the budget: refinement and objects build lists of their own, which also grow with the entries.
                 let keeps = self.kept_bytes().saturating_add(self.largest_part_bytes()) <= budget_bytes / 2;
                 let for_groups = if keeps { budget_bytes - self.kept_bytes() } else { budget_bytes };
-                let kept = keeps.then(|| Vec::with_capacity(self.parts().len()));
+                let kept = keeps.then(|| Vec::with_capacity(self.parts.len()));
                 (self.groups(for_groups, 1), Source::Files { kept })
             }
         };

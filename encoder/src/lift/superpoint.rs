@@ -133,11 +133,7 @@ impl Graph {
         let chunks = usable.par_chunks(GAUSSIANS_PER_TASK).enumerate();
         let chunks: Vec<Vec<Edge>> =
             chunks.map(|(at, chunk)| edges_of(chunk, at * GAUSSIANS_PER_TASK)).collect();
-        let mut edges: Vec<Edge> = vec![(0, 0, 0); chunks.iter().map(Vec::len).sum()];
-        let mut rest = &mut edges[..];
-        let places: Vec<&mut [Edge]> =
-            chunks.iter().map(|chunk| rest.split_off_mut(..chunk.len()).unwrap_or_default()).collect();
-        places.into_par_iter().zip(&chunks).for_each(|(place, chunk)| place.copy_from_slice(chunk));
+        let mut edges: Vec<Edge> = slag_raster::concat(&chunks);
         drop(chunks);
         edges.par_sort_unstable();
         Self { n_gaussians: scene.len(), usable, edges }
@@ -168,8 +164,8 @@ impl Superpoints {
     }
 
     /// Bytes to partition `n_gaussians` at `n_scales` at once: neighbours during the search, then with edges and joins.
-    pub(crate) fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
-        let n = settings.n_neighbours;
+    pub(crate) fn working_bytes(n_gaussians: usize, n_scales: usize) -> u64 {
+        let n = SuperpointSettings::default().n_neighbours;
         let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);
         let of_one = size_of::<Look>() + (1 + 5 * n_scales) * size_of::<u32>();
         let joined = n * (size_of::<u32>() + size_of::<Edge>()) + of_one;

@@ -26,7 +26,7 @@ fn first_number(n: usize, n_more: usize, what: &'static str) -> Result<u32, Cont
     if fits { Ok(n as u32) } else { Err(ContributionError::TooManyInAll { what }) }
 }
 
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct RegionTable {
     dim: usize,
     /// `[n_masks][dim]`, unit.
@@ -43,14 +43,7 @@ pub struct RegionTable {
 
 impl RegionTable {
     pub fn new(dim: usize) -> Self {
-        Self {
-            dim,
-            mask_vectors: Vec::new(),
-            starts: vec![0],
-            masks: Vec::new(),
-            shares: Vec::new(),
-            levels: Vec::new(),
-        }
+        Self { dim, starts: vec![0], ..Self::default() }
     }
 
     pub fn dim(&self) -> usize {

@@ -181,7 +181,7 @@ proptest! {
 fn parts_of_a_cell_make_the_cell() {
     let whole = scene_of(5, 10_000, 4);
     let (index, table) = ContributionIndex::open_with(&whole.paths, 5, &[10_000], 1).expect("opens");
-    assert_eq!(index.parts().len(), 3);
+    assert_eq!(index.parts.len(), 3);
     let field = |contributions: PartContributions| {
         let locals = contributions.part.locals.clone();
         let mut embeddings = vec![0.0; locals.len() * 5];
@@ -199,7 +199,7 @@ fn parts_of_a_cell_make_the_cell() {
 fn parts_that_fit_the_budget_are_read_once() {
     let scene = scene_of(5, 10_000, 4);
     let (index, mut table) = ContributionIndex::open_with(&scene.paths, 5, &[10_000], 9000).expect("opens");
-    assert!(index.parts().len() > 1);
+    assert!(index.parts.len() > 1);
     let pass = |table: &RegionTable, budget_bytes| -> Result<Vec<PartContributions>, ContributionError> {
         index.transposed_parts(table, budget_bytes).collect()
     };
@@ -237,7 +237,7 @@ fn foreign_files_are_refused() {
     let path = scene.paths[0].with_file_name("flipped.contributions");
     fs_err::write(&path, bytes).expect("writes");
     let opened = ContributionIndex::open(&[path], 5, &[5000]);
-    let read = opened.and_then(|(index, _)| index.read(0..index.parts().len()).map(drop));
+    let read = opened.and_then(|(index, _)| index.read(0..index.parts.len()).map(drop));
     assert!(read.expect_err("refused").to_string().contains("flipped.contributions"));
     let mut view = ViewContributions {
         dim: 1,

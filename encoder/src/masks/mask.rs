@@ -1,7 +1,5 @@
 //! One mask of an image.
 
-use super::bits::Bits;
-
 /// Pixels outside all masks, in [`RegionMap::region_of_pixel`](super::RegionMap::region_of_pixel) and label images.
 pub const NO_REGION: u32 = u32::MAX;
 
@@ -21,6 +19,25 @@ impl BoxPx {
 
     pub fn height_px(&self) -> u32 {
         self.y1 - self.y0
+    }
+
+    pub(crate) fn area_px(&self) -> u64 {
+        u64::from(self.width_px()) * u64::from(self.height_px())
+    }
+
+    /// Place of a pixel in the box, row-major.
+    pub(crate) fn place_of(&self, x: u32, y: u32) -> usize {
+        (y - self.y0) as usize * self.width_px() as usize + (x - self.x0) as usize
+    }
+
+    /// The smallest box around both.
+    pub(crate) fn join(self, other: Self) -> Self {
+        Self {
+            x0: self.x0.min(other.x0),
+            y0: self.y0.min(other.y0),
+            x1: self.x1.max(other.x1),
+            y1: self.y1.max(other.y1),
+        }
     }
 }
 
@@ -43,7 +60,7 @@ impl Mask {
 
     /// All pixels of a box, level 0.
     pub fn whole(box_px: BoxPx) -> Self {
-        let area_px = box_px.width_px() * box_px.height_px();
+        let area_px = box_px.area_px() as u32;
         Self { box_px, inside: Bits::of(true, area_px as usize), area_px, level: 0 }
     }
 
@@ -59,9 +76,7 @@ impl Mask {
 
     pub fn contains(&self, x: u32, y: u32) -> bool {
         let BoxPx { x0, y0, x1, y1 } = self.box_px;
-        (x0..x1).contains(&x)
-            && (y0..y1).contains(&y)
-            && self.inside.get((y - y0) as usize * self.box_px.width_px() as usize + (x - x0) as usize)
+        (x0..x1).contains(&x) && (y0..y1).contains(&y) && self.inside.get(self.box_px.place_of(x, y))
     }
 }
 
@@ -86,8 +101,7 @@ pub fn masks_of_labels(
             *area_px += 1;
         }
     }
-    let box_area_px = |b: &BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
-    let total_px: u64 = boxes.iter().filter(|(_, area)| *area > 0).map(|(b, _)| box_area_px(b)).sum();
+    let total_px: u64 = boxes.iter().filter(|(_, area)| *area > 0).map(|(b, _)| b.area_px()).sum();
     if total_px > limit_px {
         return None;
     }
@@ -95,16 +109,96 @@ pub fn masks_of_labels(
     let mut masks = Vec::new();
     for ((box_px, area_px), label) in boxes.into_iter().zip(0_u32..).filter(|((_, area), _)| *area > 0) {
         slot_of_label[label as usize] = masks.len();
-        let inside = Bits::of(false, box_area_px(&box_px) as usize);
+        let inside = Bits::of(false, box_px.area_px() as usize);
         masks.push((label, Mask { box_px, inside, area_px, level: 0 }));
     }
     for (row, y) in rows() {
         for (label, x) in row.iter().zip(0_u32..).filter(|(label, _)| **label != NO_REGION) {
             let mask = &mut masks[slot_of_label[*label as usize]].1;
-            let at = (y - mask.box_px.y0) as usize * mask.box_px.width_px() as usize
-                + (x - mask.box_px.x0) as usize;
-            mask.inside.set(at, true);
+            mask.inside.set(mask.box_px.place_of(x, y), true);
         }
     }
     Some(masks)
+}
+
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Bits {
+    words: Vec<u64>,
+    len: usize,
+}
+
+impl Bits {
+    pub fn of(value: bool, len: usize) -> Self {
+        if value { (0..len).map(|_| true).collect() } else { Self { words: vec![0; len.div_ceil(64)], len } }
+    }
+
+    pub fn n_px(&self) -> usize {
+        self.len
+    }
+
+    /// # Panics
+    /// If `at` is not below the length.
+    pub fn get(&self, at: usize) -> bool {
+        assert!(at < self.len, "{at} of {} bits", self.len);
+        self.words[at / 64] >> (at % 64) & 1 == 1
+    }
+
+    /// # Panics
+    /// If `at` is not below the length.
+    pub fn set(&mut self, at: usize, value: bool) {
+        assert!(at < self.len, "{at} of {} bits", self.len);
+        let bit = 1 << (at % 64);
+        let word = &mut self.words[at / 64];
+        *word = if value { *word | bit } else { *word & !bit };
+    }
+
+    pub fn iter(&self) -> impl Iterator<Item = bool> {
+        (0..self.len).map(|at| self.get(at))
+    }
+
+    pub fn count(&self) -> usize {
+        self.words.iter().map(|word| word.count_ones() as usize).sum()
+    }
+}
+
+impl FromIterator<bool> for Bits {
+    fn from_iter<I: IntoIterator<Item = bool>>(bits: I) -> Self {
+        let mut made = Self::default();
+        for bit in bits {
+            if made.len.is_multiple_of(64) {
+                made.words.push(0);
+            }
+            made.len += 1;
+            if bit {
+                made.set(made.len - 1, true);
+            }
+        }
+        made.words.shrink_to_fit();
+        made
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use slag_math::random::Random;
+
+    use super::*;
+
+    /// Oracle: a byte each.
+    #[test]
+    fn bits_are_as_bytes() {
+        let mut random = Random::new(5);
+        for len in [0, 1, 63, 64, 65, 1000] {
+            let mut bytes: Vec<bool> = (0..len).map(|_| random.unit() < 0.3).collect();
+            let mut bits: Bits = bytes.iter().copied().collect();
+            for at in (0..len).step_by(7) {
+                bytes[at] ^= true;
+                bits.set(at, bytes[at]);
+            }
+            assert!(bits.n_px() == len && bits.iter().eq(bytes.iter().copied()));
+            assert_eq!(bits.count(), bytes.iter().filter(|byte| **byte).count());
+            assert!((0..len).all(|at| bits.get(at) == bytes[at]) && bits.words.len() == len.div_ceil(64));
+            assert_eq!(Bits::of(true, len).count(), len);
+        }
+    }
 }

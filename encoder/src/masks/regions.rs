@@ -260,9 +260,8 @@ fn for_each_pixel(mask: &Mask, columns: &[u32], rows: &[u32], mut visit: impl Fn
     let box_px = mask.box_px;
     let (in_columns, in_rows) = (range(columns, box_px.x0, box_px.x1), range(rows, box_px.y0, box_px.y1));
     for row in in_rows {
-        let start = (rows[row] - box_px.y0) as usize * box_px.width_px() as usize;
         for column in in_columns.clone() {
-            if mask.inside.get(start + (columns[column] - box_px.x0) as usize) {
+            if mask.inside.get(box_px.place_of(columns[column], rows[row])) {
                 visit(row * columns.len() + column);
             }
         }

@@ -6,8 +6,7 @@
 
 use serde::Serialize;
 
-use super::bits::Bits;
-use super::mask::{BoxPx, Mask};
+use super::mask::{Bits, BoxPx, Mask};
 
 /// Most digits of a signed 32-bit number, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;
@@ -178,14 +177,12 @@ impl Rle {
     /// Decodes to a mask of level 0; `None` if empty. Allocates one bit per pixel of [`Rle::box_px`].
     pub fn to_mask(&self) -> Option<Mask> {
         let box_px = self.box_px()?;
-        let width = box_px.width_px() as usize;
-        let mut inside = Bits::of(false, width * box_px.height_px() as usize);
+        let height = u64::from(self.height_px);
+        let mut inside = Bits::of(false, box_px.area_px() as usize);
         let mut area_px = 0;
         for (start, len) in self.runs_inside() {
             for pixel in start..start + len {
-                let x = (pixel / u64::from(self.height_px)) as u32 - box_px.x0;
-                let y = (pixel % u64::from(self.height_px)) as u32 - box_px.y0;
-                inside.set(y as usize * width + x as usize, true);
+                inside.set(box_px.place_of((pixel / height) as u32, (pixel % height) as u32), true);
             }
             area_px += len as u32;
         }

@@ -6,15 +6,13 @@
 
 mod process;
 
-use std::fmt;
-
 use serde::Serialize;
 
 pub(crate) use process::give_back;
 pub use process::peak_bytes;
 
 /// The steps of a run, one after the other, each with memory of its own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
     /// From the first view to the end.
@@ -41,57 +39,19 @@ pub enum Phase {
     Publish,
 }
 
-/// Phases that hold memory, first those before all views' contributions are opened.
-const PHASES: [Phase; 7] = [
-    Phase::Views,
-    Phase::Occupancy,
-    Phase::Landmarks,
-    Phase::Superpoints,
-    Phase::Objects,
-    Phase::Refine,
-    Phase::Cells,
-];
-const N_BEFORE_MERGE: usize = 3;
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Reservation {
-    pub purpose: &'static str,
-    pub len_bytes: u64,
+#[derive(Clone, Copy, Debug)]
+struct Reservation {
+    purpose: &'static str,
+    len_bytes: u64,
     phase: Phase,
 }
 
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// What is needed, for what, and what to change.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
 pub struct MemoryError {
-    pub available_bytes: u64,
     pub needed_bytes: u64,
-    /// Whether no view was done yet.
-    pub is_before_views: bool,
-    phase: Phase,
-    /// Reservations held at the same time, largest first.
-    pub parts: Vec<Reservation>,
-}
-
-impl std::error::Error for MemoryError {}
-
-impl fmt::Display for MemoryError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { available_bytes, needed_bytes, is_before_views, phase, parts } = self;
-        let when = match is_before_views {
-            true => "at least",
-            false => "for the contributions of all views",
-        };
-        let or_else = match (is_before_views, phase) {
-            (true, Phase::Views) => " or lower --threads",
-            (true, Phase::Cells) => " or lower --cell-gaussians",
-            (true, Phase::Occupancy) => " or give --occupancy larger voxels",
-            (true, Phase::Landmarks) => " or leave --locate out",
-            _ => "",
-        };
-        let parts = parts.iter().map(|part| format!("{} for {}", part.len_bytes, part.purpose));
-        let parts = parts.collect::<Vec<_>>().join(", ");
-        write!(f, "--memory is {available_bytes} bytes, {needed_bytes} are needed {when}: {parts}; ")?;
-        write!(f, "raise --memory{or_else}")
-    }
+    message: String,
 }
 
 /// The reservations of a run, within a budget: scene, photos in work with their masks and crops, places, landmarks,
@@ -132,23 +92,32 @@ impl MemoryPlan {
 
     /// Bytes that the most expensive phase leaves for the contributions read at a time.
     pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
-        let phases = &PHASES[if self.is_before_views { 0 } else { N_BEFORE_MERGE }..];
-        let most = phases.iter().copied().max_by_key(|phase| self.reserved_bytes(*phase));
-        let most = most.unwrap_or(Phase::Always);
+        let phases = self.reservations.iter().map(|r| r.phase);
+        // Once the views are done, what they and what precedes the merge took is free.
+        let phases = phases.filter(|phase| self.is_before_views || *phase > Phase::Merge);
+        let most = phases.max_by_key(|phase| self.reserved_bytes(*phase)).unwrap_or(Phase::Always);
         let needed_bytes = self.reserved_bytes(most).saturating_add(contributions_bytes);
         if needed_bytes <= self.available_bytes {
             return Ok(self.rest_of(most));
         }
-        let contributions = Reservation {
-            purpose: "contributions of a part of a cell",
-            len_bytes: contributions_bytes,
-            phase: Phase::Always,
+        let contributions = (contributions_bytes, "contributions of a part of a cell");
+        let held = self.of_phase(most).map(|r| (r.len_bytes, r.purpose)).chain([contributions]);
+        let mut parts: Vec<(u64, &str)> = held.filter(|(len_bytes, _)| *len_bytes > 0).collect();
+        parts.sort_by_key(|(len_bytes, _)| std::cmp::Reverse(*len_bytes));
+        let parts: Vec<String> = parts.iter().map(|(n, purpose)| format!("{n} for {purpose}")).collect();
+        let (when, or_else) = match (self.is_before_views, most) {
+            (false, _) => ("for the contributions of all views", ""),
+            (true, Phase::Views) => ("at least", " or lower --threads"),
+            (true, Phase::Cells) => ("at least", " or lower --cell-gaussians"),
+            (true, Phase::Occupancy) => ("at least", " or give --occupancy larger voxels"),
+            (true, Phase::Landmarks) => ("at least", " or leave --locate out"),
+            (true, _) => ("at least", ""),
         };
-        let mut parts: Vec<Reservation> =
-            self.of_phase(most).chain([contributions]).filter(|r| r.len_bytes > 0).collect();
-        parts.sort_by_key(|r| std::cmp::Reverse(r.len_bytes));
-        let Self { available_bytes, is_before_views, .. } = *self;
-        Err(MemoryError { available_bytes, needed_bytes, is_before_views, phase: most, parts })
+        let (available_bytes, parts) = (self.available_bytes, parts.join(", "));
+        let message = format!(
+            "--memory is {available_bytes} bytes, {needed_bytes} are needed {when}: {parts}; raise --memory{or_else}"
+        );
+        Err(MemoryError { needed_bytes, message })
     }
 }
 

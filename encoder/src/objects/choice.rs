@@ -46,7 +46,7 @@ struct NodeView {
     n: u32,
     weight_px: f64,
     /// Of these, the Gaussians under each mask.
-    masks: Vec<(u32, u32)>,
+    masks: BTreeMap<u32, u32>,
     /// Best intersection over union of a mask.
     agreement: f64,
     /// Uncut share of that mask's outline; 1 without one.
@@ -81,15 +81,7 @@ impl NodeView {
     fn add(&mut self, other: Self) {
         self.n += other.n;
         self.weight_px += other.weight_px;
-        self.masks.extend(other.masks);
-        self.masks.sort_unstable_by_key(|(mask, _)| *mask);
-        self.masks.dedup_by(|next, kept| {
-            let is_same = next.0 == kept.0;
-            if is_same {
-                kept.1 += next.1;
-            }
-            is_same
-        });
+        other.masks.into_iter().for_each(|(mask, n)| *self.masks.entry(mask).or_default() += n);
     }
 
     fn ious(&self, n_of_mask: &[u32]) -> impl Iterator<Item = (u32, f64)> {
@@ -244,7 +236,8 @@ mod tests {
     /// By hand: one of 11 views shows the node whole, the others' masks are cut; one of 12 is too few.
     #[test]
     fn one_of_eleven_views_must_show_an_object_whole_and_a_fifth_of_it() {
-        let view = |uncut| NodeView { n: 10, weight_px: 4096.0, masks: vec![(0, 10)], agreement: 0.9, uncut };
+        let view =
+            |uncut| NodeView { n: 10, weight_px: 4096.0, masks: [(0, 10)].into(), agreement: 0.9, uncut };
         let views = |n: u32| (0..n).map(|at| (at, view(if at == 0 { 1.0 } else { 0.5 }))).collect();
         assert!((worth(&views(11), 16, 1) - 0.9_f64.powi(8) * 2.0).abs() < 1e-6);
         assert_eq!(worth(&views(12), 16, 1), 0.0);
@@ -262,8 +255,13 @@ mod tests {
     /// By hand: a view agrees to 0.9, one a quarter as large to 0.5; the mean is 0.82.
     #[test]
     fn views_from_afar_count_less() {
-        let view =
-            |weight_px, agreement| NodeView { n: 10, weight_px, masks: vec![(0, 10)], agreement, uncut: 1.0 };
+        let view = |weight_px, agreement| NodeView {
+            n: 10,
+            weight_px,
+            masks: [(0, 10)].into(),
+            agreement,
+            uncut: 1.0,
+        };
         let views = |far_px| NodeViews::from([(0, view(9000.0, 0.9)), (1, view(far_px, 0.5))]);
         assert!((worth(&views(1024.0), 16, 1) - 0.82_f64.powi(8) * 2.0).abs() < 1e-9);
         assert!((worth(&views(4096.0), 16, 1) - 0.7_f64.powi(8) * 2.0).abs() < 1e-9);
@@ -272,8 +270,13 @@ mod tests {
     /// By hand: of two masks that agree equally, one of a standing thing counts three quarters.
     #[test]
     fn masks_of_what_stands_count_less() {
-        let mut view =
-            NodeView { n: 10, weight_px: 4096.0, masks: vec![(0, 10), (1, 8)], agreement: 0.0, uncut: 1.0 };
+        let mut view = NodeView {
+            n: 10,
+            weight_px: 4096.0,
+            masks: [(0, 10), (1, 8)].into(),
+            agreement: 0.0,
+            uncut: 1.0,
+        };
         let mut agreement = |is_standing: &[bool]| {
             let (of_masks, uncut_shares) = (&[10, 8][..], &[1.0, 0.5][..]);
             view.judge(Sizes {

@@ -8,10 +8,9 @@ use slag_common::frames::Aabb;
 use slag_math::stats::trimmed_range;
 
 use super::choice::{self, Sizes};
-use super::object::{NONE, Object, ObjectsReport, SceneObjects};
 use super::sightings::Sightings;
 use super::tree::Tree;
-use super::{near, object, tree};
+use super::{NONE, Object, ObjectsReport, SceneObjects, tree};
 use crate::codebook::ScoreMetricContext;
 use crate::lift::photos::MaskOutline;
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
@@ -37,7 +36,7 @@ pub(crate) fn find(
         None => Cow::Owned(Superpoints::new(scene.gaussians, scene.standing, &SuperpointSettings::default())),
     };
     let sightings = Sightings::gather(scene, table, &superpoints)?;
-    let pairs = tree::evidence_of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
+    let pairs = tree::evidence_of_pairs(&sightings, &tree::pairs(scene.gaussians, &superpoints));
     scene.check_cancelled()?;
     let tree = Tree::new(superpoints.n, &pairs);
     drop(pairs);
@@ -68,7 +67,7 @@ pub(crate) fn find(
     let object_of: Vec<Vec<u32>> =
         cells.map(|cell| cell.gaussians.iter().map(of_gaussian).collect()).collect();
     let objects = describe(scene, table, &object_of, &masks);
-    let calibration = object::calibrate(&objects, score_context, table.dim());
+    let calibration = super::calibrate(&objects, score_context, table.dim());
     let report = ObjectsReport {
         n_objects: objects.len(),
         n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),
@@ -100,7 +99,7 @@ impl Masks {
         uncut_shares: Vec<f32>,
     ) -> Self {
         let n_objects = object_of_superpoint.iter().flatten().max().map_or(0, |last| *last as usize + 1);
-        let places = (0u32..).zip(scene.index.n_masks_of_view());
+        let places = (0u32..).zip(scene.index.views.iter().map(|view| view.n_masks));
         let mut masks = Self {
             of_object: vec![Vec::new(); n_objects],
             weights: vec![0.0; object_of_mask.len()],
@@ -162,7 +161,7 @@ fn describe(
             n_masks: of_object.len() as u32,
             position_in_world,
             box_in_world,
-            vectors: object::choose_vectors(of_object, &masks.weights, table),
+            vectors: super::choose_vectors(of_object, &masks.weights, table),
             photo: photo.name.clone(),
             photo_box_px: photo.outlines[mask as usize].box_px,
         }

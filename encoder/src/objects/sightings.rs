@@ -1,5 +1,7 @@
 //! What each view shows of each superpoint: how many of its Gaussians, and under which masks.
 
+use std::collections::BTreeMap;
+
 use rayon::prelude::*;
 
 use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
@@ -50,7 +52,7 @@ struct Entry {
     weight: f64,
 }
 
-pub(super) fn reserve(memory: &mut MemoryPlan, n_entries: u64) {
+pub(crate) fn reserve(memory: &mut MemoryPlan, n_entries: u64) {
     let bytes_per_region = (size_of::<Entry>() + size_of::<MaskSighting>()) as u64;
     memory.reserve(Phase::Objects, "masks of superpoints", n_entries / ENTRIES_PER_REGION * bytes_per_region);
 }
@@ -62,7 +64,7 @@ impl Sightings {
         table: &RegionTable,
         superpoints: &Superpoints,
     ) -> Result<Self, ContributionError> {
-        let regions = (0u32..).zip(scene.index.n_regions_of_view());
+        let regions = (0u32..).zip(scene.index.views.iter().map(|view| view.file.n_regions));
         let view_of_region: Vec<u32> = regions.flat_map(|(view, n)| std::iter::repeat_n(view, n)).collect();
         let mut entries = Vec::new();
         for contributions in scene.index.transposed_parts(table, scene.group_bytes) {
@@ -97,22 +99,15 @@ impl Sightings {
                 let weight = of_view.iter().map(|entry| entry.weight).sum();
                 sightings.views.push((view_of(&of_view[0]), n_seen, weight, first));
                 let outlined = of_view.iter().filter(|entry| !table.is_filled(entry.region as usize));
-                let of_entry = |entry: &Entry| {
-                    let masks = table.all_masks_of(entry.region as usize).iter();
-                    let (n, weight) = (entry.n, entry.weight);
-                    masks.map(move |mask| MaskSighting { mask: *mask, n, weight })
-                };
-                let mut masks: Vec<MaskSighting> = outlined.flat_map(of_entry).collect();
-                masks.sort_by_key(|of_mask| of_mask.mask);
-                masks.dedup_by(|next, kept| {
-                    let is_same = next.mask == kept.mask;
-                    if is_same {
-                        kept.n += next.n;
-                        kept.weight += next.weight;
+                let mut masks: BTreeMap<u32, (u32, f64)> = BTreeMap::new();
+                for entry in outlined {
+                    for mask in table.all_masks_of(entry.region as usize) {
+                        let (n, weight) = masks.entry(*mask).or_default();
+                        (*n, *weight) = (*n + entry.n, *weight + entry.weight);
                     }
-                    is_same
-                });
-                sightings.masks.append(&mut masks);
+                }
+                let masks = masks.into_iter().map(|(mask, (n, weight))| MaskSighting { mask, n, weight });
+                sightings.masks.extend(masks);
             }
         }
         sightings.starts.push(sightings.views.len());

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::occupancy::BLOCK_EDGE;
 
-use super::lattice::{BlockAt, Lattice};
+use super::owners::{BlockAt, Lattice};
 
 /// Opacity from which a voxel is occupied (splat-transform's, for voxels of 5 cm).
 pub const MIN_OPACITY: f32 = 0.1;
@@ -113,9 +113,7 @@ impl Ellipsoid {
             }
         }
     }
-}
 
-impl Ellipsoid {
     /// Tiles that the box reaches along each axis.
     fn reached(&self) -> Option<Reached> {
         Some([self.tiles(0)?, self.tiles(1)?, self.tiles(2)?])

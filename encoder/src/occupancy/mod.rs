@@ -1,7 +1,6 @@
 //! Which places are free, occupied or unknown, for robots that move. The definition is in `docs/numerics.md`.
 
 mod density;
-mod lattice;
 mod owners;
 mod seen;
 
@@ -14,7 +13,7 @@ use slag_common::{Gaussians, View};
 use crate::cells::{CellSplit, NO_CELL};
 use crate::memory::{MemoryError, MemoryPlan, Phase};
 use crate::raster::{LoadedScene, RasterError, RasterView};
-use lattice::Lattice;
+use owners::Lattice;
 use seen::Candidate;
 
 pub use density::MIN_OPACITY;
@@ -54,16 +53,13 @@ impl SceneOccupancy {
 /// Bytes per candidate: with what was seen there, and as a block both in the list of all and in its cell's.
 const BYTES_PER_CANDIDATE: u64 = (size_of::<Candidate>() + 2 * size_of::<Block>()) as u64;
 
+#[derive(Debug, thiserror::Error)]
 pub(crate) enum OccupancyError {
-    Memory(MemoryError),
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
     /// The view of this index cannot be drawn.
+    #[error("view {0}: {1}")]
     View(usize, RasterError),
-}
-
-impl From<MemoryError> for OccupancyError {
-    fn from(error: MemoryError) -> Self {
-        Self::Memory(error)
-    }
 }
 
 /// Finds free and occupied places from a scene's Gaussians and views, within `memory`; `None` if cancelled.

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use slag_common::Intrinsics;
 use slag_common::occupancy::BLOCK_EDGE;
 
-use super::lattice::{BlockAt, Lattice};
+use super::owners::{BlockAt, Lattice};
 use crate::raster::{Drawing, RasterView};
 
 /// Views that must look through a free voxel: one may look through a hole in the splat.

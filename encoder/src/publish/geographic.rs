@@ -8,22 +8,14 @@ use serde_json::json;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::Manifest;
 
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub(crate) enum GeographicError {
-    #[error(
-        "the scene is not geo-referenced; ask in the world frame (x, y, z), or encode it with a geo-reference"
-    )]
-    NotGeoReferenced,
-    #[error("latitude {found_deg} is not within -90..=90 degrees; check the order of lat and lon")]
-    Latitude { found_deg: f64 },
-    #[error("longitude {found_deg} is not within -180..=180 degrees")]
-    Longitude { found_deg: f64 },
-    #[error("height {found_m} is not a finite number of metres")]
-    Height { found_m: f64 },
-}
+/// Fault of a request for places on the earth, for people.
+type Refusal = String;
 
-fn reference_of(manifest: &Manifest) -> Result<&GeoReference, GeographicError> {
-    manifest.geo_reference.as_ref().ok_or(GeographicError::NotGeoReferenced)
+fn reference_of(manifest: &Manifest) -> Result<&GeoReference, Refusal> {
+    manifest.geo_reference.as_ref().ok_or_else(|| {
+        "the scene is not geo-referenced; ask in the world frame (x, y, z), or encode it with a geo-reference"
+            .into()
+    })
 }
 
 /// A geographic position in the world frame, metres. Without a height, that of the world frame's origin.
@@ -32,17 +24,19 @@ pub(crate) fn world_from_geographic(
     latitude_deg: f64,
     longitude_deg: f64,
     height_m: Option<f64>,
-) -> Result<DVec3, GeographicError> {
+) -> Result<DVec3, Refusal> {
     let reference = reference_of(manifest)?;
     if !(-90.0..=90.0).contains(&latitude_deg) {
-        return Err(GeographicError::Latitude { found_deg: latitude_deg });
+        return Err(format!(
+            "latitude {latitude_deg} is not within -90..=90 degrees; check the order of lat and lon"
+        ));
     }
     if !(-180.0..=180.0).contains(&longitude_deg) {
-        return Err(GeographicError::Longitude { found_deg: longitude_deg });
+        return Err(format!("longitude {longitude_deg} is not within -180..=180 degrees"));
     }
     let height_m = height_m.unwrap_or(reference.origin.height_m);
     if !height_m.is_finite() {
-        return Err(GeographicError::Height { found_m: height_m });
+        return Err(format!("height {height_m} is not a finite number of metres"));
     }
     Ok(reference.world_from_geographic(Geographic { latitude_deg, longitude_deg, height_m }))
 }
@@ -152,7 +146,7 @@ fn closed(ring: Vec<Coord>) -> Polygon {
 
 /// Footprints of a scene's cells as GeoJSON: one feature per cell, with `cell_id`, `n_gaussians` and `area_m2`
 /// (geodesic, WGS 84). The foreign member `scene` has the name, the generation, and the convex `outline` of all cells.
-pub fn coverage(manifest: &Manifest) -> Result<FeatureCollection, GeographicError> {
+pub fn coverage(manifest: &Manifest) -> Result<FeatureCollection, Refusal> {
     let reference = reference_of(manifest)?;
     let features = manifest.cells.iter().map(|cell| {
         let footprint = footprint(&cell.bounds, reference);

@@ -10,7 +10,7 @@ use slag_raster::{Drawing, RasterView};
 
 use super::cpu::CpuRasterizer;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
-use super::rasterizer::{GpuSlots, LoadedScene, RasterError, Rasterizer, ViewWeights};
+use super::{LoadedScene, RasterError, Rasterizer, ViewWeights};
 use crate::lanes::Lanes;
 use crate::masks::RegionMap;
 
@@ -224,8 +224,8 @@ impl LoadedScene for SharedScene<'_> {
         self.run(|scene| scene.draw(view, background))
     }
 
-    fn gpus(&self) -> Option<GpuSlots> {
-        Some(GpuSlots { n_gpus: self.gpus.len(), views_in_flight: self.views_in_flight })
+    fn views_on_gpus(&self) -> Option<usize> {
+        Some(self.gpus.len() * self.views_in_flight)
     }
 }
 

@@ -4,9 +4,9 @@ use std::convert::Infallible;
 
 use slag_common::Gaussians;
 
-pub(crate) use super::adapter::AdapterReport;
-pub use super::adapter::{GpuOptions, Precision};
-use super::rasterizer::{LoadedScene, RasterError, Rasterizer};
+pub(crate) use super::AdapterReport;
+pub use super::{GpuOptions, Precision};
+use super::{LoadedScene, RasterError, Rasterizer};
 
 pub struct Adapter {
     pub report: AdapterReport,

@@ -11,17 +11,14 @@ use std::iter;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
+use image::{RgbImage, imageops};
 use slag_math::graph_segmentation::Components;
 use slag_math::union_find::{NOT_NUMBERED, Numbering};
 use slag_models::SessionOptions;
 use slag_models::boundaries::Boundaries;
 use slag_models::session::SessionError;
 
-use image::{RgbImage, imageops};
-
-use super::colour::{distance, lab_of, smooth};
-use super::segmenter::{SegmentError, SegmentInput, Segmenter};
-use super::support;
+use super::{SegmentError, SegmentInput, Segmenter};
 use crate::masks::regions::nearest;
 use crate::masks::{Bits, BoxPx, Mask, NO_REGION, masks_of_labels};
 
@@ -184,8 +181,7 @@ impl Segmenter for GraphSegmenter {
         let edges = raster.edges_by_weight(&self.settings, boundaries.as_deref());
         let n_pixels = raster.lab.len();
         let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(MIN_AREA_PX);
-        let image = Segmented { raster: &raster, boundaries: boundaries.as_deref(), min_area_px };
-        let compact_scale = image.boundaries.map(|_| COMPACT_SCALE);
+        let compact_scale = boundaries.as_ref().map(|_| COMPACT_SCALE);
         let levels: Vec<Labels> = (self.settings.scales.iter().copied().chain(compact_scale))
             .map(|scale| raster.components(&edges, scale * WEIGHT_STEPS, min_area_px))
             .collect();
@@ -195,7 +191,7 @@ impl Segmenter for GraphSegmenter {
         // The finest component of each pixel without a mask.
         let mut rest = finest.map_or(Vec::new(), |finest| finest.of_pixel.clone());
         for (level, labels) in levels.iter().enumerate() {
-            let kept = self.kept(&image, &levels[..level], labels);
+            let kept = self.kept(&raster, boundaries.as_deref(), min_area_px, &levels[..level], labels);
             let mut is_kept = vec![false; labels.area_px.len()];
             kept.iter().for_each(|(label, _)| is_kept[*label as usize] = true);
             let covered = labels.of_pixel.iter().map(|label| is_kept.get(*label as usize) == Some(&true));
@@ -218,21 +214,21 @@ impl Segmenter for GraphSegmenter {
     }
 }
 
-struct Segmented<'a> {
-    raster: &'a Raster,
-    boundaries: Option<&'a [f32]>,
-    min_area_px: u32,
-}
-
 impl GraphSegmenter {
     /// Components that become masks, with their labels: large enough, in no coarser level, and outlined by boundaries.
     /// Compact ones need fewer of these; of the scale finer than all levels, only compact ones count.
-    fn kept(&self, image: &Segmented<'_>, coarser: &[Labels], labels: &Labels) -> Vec<(u32, Mask)> {
-        let &Segmented { raster, boundaries, min_area_px } = image;
+    fn kept(
+        &self,
+        raster: &Raster,
+        boundaries: Option<&[f32]>,
+        min_area_px: u32,
+        coarser: &[Labels],
+        labels: &Labels,
+    ) -> Vec<(u32, Mask)> {
         let n_components = labels.area_px.len();
         let repeats = labels.repeats_of(coarser, self.settings.max_overlap_iou);
         let support = boundaries.map(|boundaries| {
-            support::of_outlines(&labels.of_pixel, raster.width_px as usize, n_components, boundaries)
+            of_outlines(&labels.of_pixel, raster.width_px as usize, n_components, boundaries)
         });
         let is_level = coarser.len() < self.settings.scales.len();
         let is_confirmed = |label: usize, mask: &Mask| {
@@ -253,15 +249,11 @@ impl GraphSegmenter {
         if masks.len() <= self.settings.max_masks {
             return;
         }
-        let mut order: Vec<usize> = (0..masks.len()).collect();
-        order.sort_by_key(|index| (std::cmp::Reverse(masks[*index].area_px), *index));
-        let mut keep = vec![false; masks.len()];
-        order.iter().take(self.settings.max_masks).for_each(|index| keep[*index] = true);
-        let mut index = 0;
-        masks.retain(|_| {
-            index += 1;
-            keep[index - 1]
-        });
+        let mut numbered: Vec<(usize, Mask)> = std::mem::take(masks).into_iter().enumerate().collect();
+        numbered.sort_by_key(|(_, mask)| std::cmp::Reverse(mask.area_px));
+        numbered.truncate(self.settings.max_masks);
+        numbered.sort_by_key(|(number, _)| *number);
+        masks.extend(numbered.into_iter().map(|(_, mask)| mask));
     }
 }
 
@@ -483,14 +475,111 @@ fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
     };
     let ((x0, x1), (y0, y1)) =
         (range(columns, mask.box_px.x0, mask.box_px.x1), range(rows, mask.box_px.y0, mask.box_px.y1));
-    let of_row = |row: &u32| {
-        let start = (row - mask.box_px.y0) as usize * mask.box_px.width_px() as usize;
-        let columns = &columns[x0 as usize..x1 as usize];
-        columns.iter().map(move |column| mask.inside.get(start + (column - mask.box_px.x0) as usize))
+    let of_row = |y: &u32| {
+        let columns = columns[x0 as usize..x1 as usize].iter();
+        columns.map(|x| mask.inside.get(mask.box_px.place_of(*x, *y))).collect::<Vec<bool>>()
     };
     let inside: Bits = rows[y0 as usize..y1 as usize].iter().flat_map(of_row).collect();
     let area_px = inside.count() as u32;
     (area_px > 0).then_some(Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside, area_px, level: mask.level })
+}
+
+pub(super) fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
+    let [l, m, n] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    (l * l + m * m + n * n).sqrt()
+}
+
+/// Converts sRGB (IEC 61966-2-1) to CIE L*a*b* of illuminant D65 (CIE 15).
+pub(super) fn lab_of(image: &RgbImage) -> Vec<[f32; 3]> {
+    let linear: Vec<f32> = (0..=255_u8)
+        .map(|value| {
+            let v = f32::from(value) / 255.0;
+            if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+        })
+        .collect();
+    let root = |t: f32| if t > 216.0 / 24389.0 { t.cbrt() } else { (24389.0 / 27.0 * t + 16.0) / 116.0 };
+    let lab = |pixel: &image::Rgb<u8>| {
+        let [r, g, b] = pixel.0.map(|value| linear[usize::from(value)]);
+        let x = root((0.4124564 * r + 0.3575761 * g + 0.1804375 * b) / 0.95047);
+        let y = root(0.2126729 * r + 0.7151522 * g + 0.072175 * b);
+        let z = root((0.0193339 * r + 0.119192 * g + 0.9503041 * b) / 1.08883);
+        [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
+    };
+    image.pixels().map(lab).collect()
+}
+
+/// Gaussian truncated at four standard deviations; border pixels are repeated outwards.
+pub(super) fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
+    let radius = (4.0 * sigma_px).ceil().clamp(0.0, 64.0) as usize;
+    if radius == 0 || width == 0 {
+        return;
+    }
+    let mut kernel: Vec<f32> =
+        (0..=2 * radius).map(|i| (-0.5 * ((i as f32 - radius as f32) / sigma_px).powi(2)).exp()).collect();
+    let sum: f32 = kernel.iter().sum();
+    kernel.iter_mut().for_each(|weight| *weight /= sum);
+
+    // Along rows, then along columns; sums run over whole rows, so that no pixel is handled alone.
+    let height = lab.len() / width;
+    let add = |sums: &mut [[f32; 3]], weight: f32, colours: &[[f32; 3]]| {
+        let (sums, colours) = (sums.as_flattened_mut().iter_mut(), colours.as_flattened());
+        sums.zip(colours).for_each(|(sum, colour)| *sum += weight * colour);
+    };
+    let mut padded = Vec::new();
+    for row in lab.chunks_exact_mut(width) {
+        padded.clear();
+        padded.extend((0..width + 2 * radius).map(|i| row[i.saturating_sub(radius).min(width - 1)]));
+        row.fill([0.0; 3]);
+        kernel.iter().zip(padded.windows(width)).for_each(|(weight, shifted)| add(row, *weight, shifted));
+    }
+    let rows = lab.to_vec();
+    for (y, row) in lab.chunks_exact_mut(width).enumerate() {
+        row.fill([0.0; 3]);
+        for (i, weight) in kernel.iter().enumerate() {
+            let from = (y + i).saturating_sub(radius).min(height - 1) * width;
+            add(row, *weight, &rows[from..from + width]);
+        }
+    }
+}
+
+/// For each component, the mean, over the pairs of pixels across its outline, of the strongest boundary predicted
+/// within a pixel: 0 to 1, and 1 without an outline. The photo's edge is no outline. `of_pixel`: each pixel's
+/// component, row-major. `boundaries`: `[neighbour][pixel]`, the first to the right, the third below.
+pub(super) fn of_outlines(
+    of_pixel: &[u32],
+    width_px: usize,
+    n_components: usize,
+    boundaries: &[f32],
+) -> Vec<f32> {
+    let n_pixels = of_pixel.len();
+    let mut sums = vec![(0.0_f32, 0_u32); n_components];
+    let [right, below] =
+        [0, 2].map(|neighbour| &boundaries[neighbour * n_pixels..(neighbour + 1) * n_pixels]);
+    for pixel in 0..n_pixels {
+        let column = pixel % width_px;
+        let beside = (column + 1 < width_px).then_some((pixel + 1, right));
+        let under = (pixel + width_px < n_pixels).then_some((pixel + width_px, below));
+        for (other, predicted) in [beside, under].into_iter().flatten() {
+            let ends = [of_pixel[pixel], of_pixel[other]];
+            if ends[0] == ends[1] {
+                continue;
+            }
+            let near = [
+                (column > 0).then(|| pixel - 1),
+                (column + 1 < width_px).then_some(pixel + 1),
+                pixel.checked_sub(width_px),
+                Some(pixel + width_px).filter(|below| *below < n_pixels),
+            ];
+            let near = near.into_iter().flatten().map(|at| predicted[at]);
+            let strongest = near.fold(predicted[pixel], f32::max);
+            for component in ends.into_iter().filter(|component| *component != NO_REGION) {
+                let (sum, n) = &mut sums[component as usize];
+                *sum += strongest;
+                *n += 1;
+            }
+        }
+    }
+    sums.into_iter().map(|(sum, n)| if n == 0 { 1.0 } else { sum / n as f32 }).collect()
 }
 
 #[cfg(test)]
@@ -511,5 +600,53 @@ mod tests {
         assert!(!is_compact(0, 40, 17, &disc) && !is_compact(40, 83, 17, &disc));
         assert!(!is_compact(40, 40, 17, &|x, y| x.abs_diff(y) < 4));
         assert!(is_compact(40, 40, 17, &|_, _| true) && !is_compact(40, 40, 18, &|_, _| true));
+    }
+
+    const SIDE: usize = 8;
+
+    /// Component 1 is a square of 4 x 4 px with its upper left pixel at (x, y), component 0 the rest.
+    fn square(x: usize, y: usize) -> Vec<u32> {
+        let inside = |i: usize| (x..x + 4).contains(&(i % SIDE)) && (y..y + 4).contains(&(i / SIDE));
+        (0..SIDE * SIDE).map(|i| u32::from(inside(i))).collect()
+    }
+
+    /// Boundaries between different components, where `seen` says so.
+    fn boundaries(of_pixel: &[u32], seen: impl Fn(usize, usize) -> bool) -> Vec<f32> {
+        let mut boundaries = vec![0.0; 4 * SIDE * SIDE];
+        for i in 0..SIDE * SIDE {
+            for (neighbour, there, step) in [(0, i % SIDE + 1 < SIDE, 1), (2, i / SIDE + 1 < SIDE, SIDE)] {
+                if there && of_pixel[i] != of_pixel[i + step] && seen(i % SIDE, i / SIDE) {
+                    boundaries[neighbour * SIDE * SIDE + i] = 1.0;
+                }
+            }
+        }
+        boundaries
+    }
+
+    /// Support of both components where boundaries are those of `predicted` that `seen` says.
+    fn support(of_pixel: &[u32], predicted: &[u32], seen: impl Fn(usize, usize) -> bool) -> [f32; 2] {
+        let found = of_outlines(of_pixel, SIDE, 2, &boundaries(predicted, seen));
+        [found[0], found[1]]
+    }
+
+    /// By hand. A pixel without a component has no outline of its own.
+    #[test]
+    fn the_share_of_the_outline_that_is_predicted() {
+        let middle = square(2, 2);
+        assert_eq!(support(&middle, &middle, |_, _| true), [1.0, 1.0]);
+        assert_eq!(support(&middle, &middle, |_, _| false), [0.0, 0.0]);
+        // Without its right side, whose pairs begin in column 5; none of these is beside a pair of another side of its
+        // kind. The bottom's last pair begins in that column, too, but its neighbour is predicted.
+        assert_eq!(support(&middle, &middle, |x, y| x != 5 || !(2..6).contains(&y)), [0.75, 0.75]);
+        let mut without = middle.clone();
+        without[0] = NO_REGION;
+        assert_eq!(support(&without, &without, |_, _| true), [1.0, 1.0]);
+        // Two sides lie on the photo's edge, which is no outline.
+        let corner = square(4, 4);
+        assert_eq!(support(&corner, &corner, |_, _| true), [1.0, 1.0]);
+        assert_eq!(support(&[0; SIDE * SIDE], &[0; SIDE * SIDE], |_, _| true)[0], 1.0);
+        // A boundary may be a pixel off, but not two.
+        assert_eq!(support(&middle, &square(3, 2), |_, _| true)[1], 1.0);
+        assert!(support(&middle, &square(4, 2), |_, _| true)[1] < 0.5);
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::segmenter::{SegmentError, SegmentInput, Segmenter};
+use super::{SegmentError, SegmentInput, Segmenter};
 use crate::ground::{NO_THING, Standing};
 use crate::lanes::GpuLoad;
 use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
@@ -96,9 +96,9 @@ fn take_out(mask: &mut Mask, other: &Mask) {
     let [columns, rows] = common(&mask.box_px, &other.box_px);
     for y in rows {
         for x in columns.clone().filter(|x| other.contains(*x, y)) {
-            let at = (y - mask.box_px.y0) * mask.box_px.width_px() + x - mask.box_px.x0;
-            mask.area_px -= u32::from(mask.inside.get(at as usize));
-            mask.inside.set(at as usize, false);
+            let at = mask.box_px.place_of(x, y);
+            mask.area_px -= u32::from(mask.inside.get(at));
+            mask.inside.set(at, false);
         }
     }
 }

@@ -5,10 +5,9 @@ use half::f16;
 use rayon::prelude::*;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::hash::Hash32;
-use slag_common::landmarks::{BuiltLandmarks, Landmark, Landmarks};
+use slag_common::landmarks::{BuiltLandmarks, Landmark};
 use slag_common::objects::Objects;
-use slag_common::occupancy::Occupancy;
-use slag_common::photo_poses::{BuiltPhotoPoses, PhotoPoses};
+use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::{
     Additions, ExactColumns, IndexColumn, PositionForm, Positions, Profile, Residuals, ScoreErrors,
     ShardHeader, ShardView,
@@ -80,17 +79,6 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
 
-/// What a cell's shards carry beside Gaussians and embeddings.
-#[derive(Clone, Copy, Default)]
-pub struct CellExtras<'a> {
-    pub objects: Option<&'a SceneObjects>,
-    /// Free and occupied places, if asked for.
-    pub occupancy: Option<Occupancy<'a>>,
-    pub photo_poses: Option<PhotoPoses<'a>>,
-    /// By which robots recognise the cell, if asked for.
-    pub landmarks: Option<Landmarks<'a>>,
-}
-
 #[derive(Clone, Copy)]
 pub struct ShardBuilder<'a> {
     pub scene: &'a Gaussians,
@@ -132,7 +120,8 @@ impl ShardBuilder<'_> {
         cell_id: u32,
         cell: &Cell,
         embeddings: &CellEmbeddings,
-        extras: CellExtras<'_>,
+        objects: Option<&SceneObjects>,
+        additions: Additions<'_>,
     ) -> BuiltCell {
         let (settings, dim) = (self.settings, embeddings.dim);
         let (codebook, order) = self.codebook(cell, embeddings);
@@ -153,17 +142,12 @@ impl ShardBuilder<'_> {
         let of_cell = |objects| {
             CellObjects::new(objects, cell_id, &order.locals, &CentroidBasis::new(dim, compact.basis))
         };
-        let objects = extras.objects.map(of_cell);
+        let objects = objects.map(of_cell);
         let objects = objects.as_ref().map(CellObjects::view);
         let appearance =
             settings.have_appearance().then(|| AppearanceColumns::of(self.scene, &order.in_input()));
-        let additions = Additions {
-            objects,
-            appearance: appearance.as_ref().map(AppearanceColumns::view),
-            occupancy: extras.occupancy,
-            photo_poses: extras.photo_poses,
-            landmarks: extras.landmarks,
-        };
+        let appearance = appearance.as_ref().map(AppearanceColumns::view);
+        let additions = Additions { objects, appearance, ..additions };
         let chosen = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
         let shards = chosen.map(|profile| match profile {
             Profile::Compact if settings.compact_appearance => built(profile, &compact, additions),

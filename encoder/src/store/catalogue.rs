@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 
-use super::error::StoreError;
+use super::StoreError;
 
 /// sled keeps whole pages in memory; the records are small.
 const CACHE_BYTES: u64 = 16 << 20;
@@ -32,19 +32,6 @@ pub(crate) struct GenerationRecord {
     pub(crate) created_unix_secs: u64,
     pub(crate) n_cells: usize,
     pub(crate) n_gaussians: u64,
-}
-
-impl GenerationRecord {
-    fn of(manifest: &Manifest, manifest_hash: Hash32) -> Self {
-        Self {
-            scene: manifest.scene.clone(),
-            generation: manifest.generation,
-            manifest_hash,
-            created_unix_secs: manifest.created_unix_secs,
-            n_cells: manifest.cells.len(),
-            n_gaussians: manifest.n_gaussians,
-        }
-    }
 }
 
 enum Fault {
@@ -101,7 +88,7 @@ impl Catalogue {
     pub(crate) fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
         if SystemTime::now() < UNIX_EPOCH {
             // sled panics then.
-            return Err(StoreError::Clock);
+            return Err(StoreError::Failed("this machine's clock says a time before 1970; set it".into()));
         }
         let path = store.join("db");
         let refused = |fault| match fault {
@@ -169,7 +156,14 @@ impl Catalogue {
     pub(crate) fn record(&self, manifest: &Manifest, manifest_hash: Hash32) -> Result<(), StoreError> {
         let write = || -> Result<(), Fault> {
             let key = manifest.generation.to_be_bytes();
-            let record = GenerationRecord::of(manifest, manifest_hash);
+            let record = GenerationRecord {
+                scene: manifest.scene.clone(),
+                generation: manifest.generation,
+                manifest_hash,
+                created_unix_secs: manifest.created_unix_secs,
+                n_cells: manifest.cells.len(),
+                n_gaussians: manifest.n_gaussians,
+            };
             let held =
                 self.generations.get(key)?.map(|bytes| decode::<GenerationRecord>(&bytes)).transpose()?;
             if held.as_ref() != Some(&record) {
@@ -184,7 +178,7 @@ impl Catalogue {
 /// A catalogue read from a copy: neither the store nor its lock is touched, so a writer may be at work.
 #[derive(Debug)]
 pub(crate) struct CatalogueCopy {
-    catalogue: Catalogue,
+    pub(crate) catalogue: Catalogue,
     _folder: tempfile::TempDir,
 }
 
@@ -206,16 +200,6 @@ impl CatalogueCopy {
         }
         let loaded = Catalogue::load(folder.path(), Duration::ZERO).ok();
         Ok(loaded.map(|catalogue| Self { catalogue, _folder: folder }))
-    }
-
-    /// The copy, for the state of jobs.
-    pub(crate) fn db(&self) -> &sled::Db {
-        self.catalogue.db()
-    }
-
-    /// All generations ever published, oldest first.
-    pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
-        self.catalogue.generations()
     }
 }
 

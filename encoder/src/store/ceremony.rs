@@ -12,9 +12,8 @@ use slag_common::tuf::{
     Body, Key, Root, SignedMetadata, Trusted, TufError, add_signatures, sha256_hex, sign,
 };
 
-use super::error::StoreError;
-use super::metadata::{Metadata, MetadataReader, ROOT_SECS, RootFile};
-use super::{files, roles};
+use super::metadata::{Metadata, MetadataReader, ROOT_SECS};
+use super::{StoreError, files, roles};
 
 pub(crate) use super::roles::root_folder as default_root_folder;
 
@@ -63,14 +62,14 @@ impl Metadata {
         root_folder: &Path,
         now_unix_secs: u64,
     ) -> Result<Changed, StoreError> {
-        let present = self.newest_root()?.ok_or_else(|| self.no_root())?.root;
+        let present = self.newest_root()?.ok_or_else(|| self.no_root())?.0;
         let body = self.next_root(&present.body, change, root_folder)?;
         let is_of_root = |key: &SigningKey| {
             let id = Key::of(key).id();
             [&present.body, &body].iter().any(|root| root.roles[Root::TYPE].keyids.contains(&id))
         };
         let signers: Vec<SigningKey> =
-            roles::read_folder(root_folder)?.into_iter().filter(is_of_root).collect();
+            roles::read_folder(root_folder, Err)?.into_iter().filter(is_of_root).collect();
         let root_version = present.head.version.saturating_add(1);
         let expires = now_unix_secs.saturating_add(ROOT_SECS);
         let bytes = sign(root_version, expires, &body, &signers.iter().collect::<Vec<_>>());
@@ -89,7 +88,7 @@ impl Metadata {
     /// # Errors
     /// [`StoreError::RootDraft`] unless it follows the present root; [`StoreError`] otherwise.
     pub(crate) fn install_root(&self, draft: &Path, now_unix_secs: u64) -> Result<Changed, StoreError> {
-        let RootFile { root: present, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
+        let (present, bytes) = self.newest_root()?.ok_or_else(|| self.no_root())?;
         let next = fs_err::read(draft)?;
         let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
         let mut trusted = Trusted::new(&bytes, now_unix_secs).map_err(refuse)?;
@@ -140,7 +139,8 @@ impl Metadata {
             keys.keyids.dedup();
         }
         if let (0, Change::Key(id)) = (n_replaced, change) {
-            return Err(StoreError::NoSuchKey { id: id.clone() });
+            let help = "`slag-encoder keys status` lists the keys";
+            return Err(StoreError::Failed(format!("no role has the key {id}; {help}")));
         }
         let used: Vec<&String> = next.roles.values().flat_map(|keys| &keys.keyids).collect();
         next.keys.retain(|id, _| used.contains(&id));
@@ -150,9 +150,13 @@ impl Metadata {
 
 impl MetadataReader {
     pub(crate) fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
-        let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
-        let mut here: Vec<String> =
-            roles::read_sound(root_folder)?.iter().map(|key| Key::of(key).id()).collect();
+        let (root, bytes) = self.newest_root()?.ok_or_else(|| self.no_root())?;
+        let warn = |error: StoreError| {
+            tracing::warn!("{error}");
+            Ok(())
+        };
+        let sound = roles::read_folder(root_folder, warn)?;
+        let mut here: Vec<String> = sound.iter().map(|key| Key::of(key).id()).collect();
         let online = roles::ONLINE.iter().filter_map(|role| roles::read(&self.store, role).ok());
         here.extend(online.map(|key| Key::of(&key).id()));
         let mut keys = Vec::new();
@@ -175,11 +179,12 @@ impl MetadataReader {
 
     /// SHA-256 of the newest root, hex.
     pub(crate) fn root_sha256(&self) -> Result<String, StoreError> {
-        Ok(sha256_hex(&self.newest_root()?.ok_or_else(|| self.no_root())?.bytes))
+        Ok(sha256_hex(&self.newest_root()?.ok_or_else(|| self.no_root())?.1))
     }
 
     fn no_root(&self) -> StoreError {
-        StoreError::NoRoot { store: self.store.clone() }
+        let store = self.store.display();
+        StoreError::Failed(format!("{store} has no root yet; run `slag-encoder keys init`, or encode"))
     }
 }
 
@@ -188,7 +193,7 @@ pub(crate) fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, Stor
     let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
     let bytes = fs_err::read(draft)?;
     SignedMetadata::<Root>::parse(Root::TYPE, &bytes).map_err(refuse)?;
-    let keys = roles::read_folder(root_folder)?;
+    let keys = roles::read_folder(root_folder, Err)?;
     let signed = add_signatures(Root::TYPE, &bytes, &keys).map_err(refuse)?;
     slag_common::durable::write(draft, &signed)?;
     Ok(keys.len())

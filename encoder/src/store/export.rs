@@ -7,19 +7,17 @@
 //! | `v1/metadata/` | metadata of The Update Framework; robots follow `timestamp.json`, which is written last |
 
 use std::collections::BTreeMap;
-use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::tuf::{TargetFile, TufError};
 use slag_common::{Hash32, durable, manifest};
 
-use super::error::StoreError;
-use super::files;
 use super::metadata::clock_unix_secs;
 use super::reader::{Published, StoreReader};
-use super::walk::{self, Refused};
+use super::verify::{self, Refused};
+use super::{StoreError, files};
 
 const FIRST_ROOT: &str = "1.root.json";
 
@@ -41,18 +39,18 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     let mut n_tries = 0;
     let (reader, metadata) = loop {
         let reader = StoreReader::open(store)?;
-        let metadata = walk::read_all(store)?;
+        let metadata = verify::read_all(store)?;
         // The manifest is published before the metadata that names it.
         if !reader.is_current() {
             continue;
         }
-        let refused = walk::refused_of(store, &metadata, &reader.current().bytes, clock_unix_secs());
+        let refused = verify::refused_of(store, &metadata, &reader.current().bytes, clock_unix_secs());
         let Some(Refused { path, what }) = refused.into_iter().next() else { break (reader, metadata) };
         n_tries += 1;
-        if n_tries == walk::N_TRIES {
+        if n_tries == verify::N_TRIES {
             return Err(StoreError::Refused { path, what });
         }
-        std::thread::sleep(walk::PAUSE);
+        std::thread::sleep(verify::PAUSE);
     };
     let folder = to.join("v1");
     let [objects, targets, of_metadata] = ["objects", "targets", "metadata"].map(|name| folder.join(name));
@@ -94,12 +92,12 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
 /// Refuses a folder that has another store's export, or what no export has; hidden files may lie there. `root`: the
 /// store's first.
 fn check_export(folder: &Path, root: Option<&Result<Vec<u8>, TufError>>) -> Result<(), StoreError> {
-    let refuse = |path: PathBuf, what| Err(StoreError::ExportFolder { path, what });
+    let refuse = |path: &Path, what| {
+        let path = path.display();
+        Err(StoreError::Failed(format!("{path}: {what}; name another folder with --out, or move this away")))
+    };
     for part in ["", "objects", "targets", "metadata"] {
-        let entries = match fs_err::read_dir(folder.join(part)) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => continue,
-            entries => entries?,
-        };
+        let Some(entries) = files::if_there(fs_err::read_dir(folder.join(part)))? else { continue };
         for entry in entries {
             let entry = entry?;
             let found = entry.file_name().to_string_lossy().into_owned();
@@ -113,17 +111,14 @@ fn check_export(folder: &Path, root: Option<&Result<Vec<u8>, TufError>>) -> Resu
                 _ => false,
             };
             if !is_ours && !found.starts_with('.') {
-                return refuse(entry.path(), "no export of a store has this");
+                return refuse(&entry.path(), "no export of a store has this");
             }
         }
     }
     let path = folder.join("metadata").join(FIRST_ROOT);
-    let exported = match fs_err::read(&path) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-        exported => exported?,
-    };
+    let Some(exported) = files::if_there(fs_err::read(&path))? else { return Ok(()) };
     match root {
         Some(Ok(root)) if *root == exported => Ok(()),
-        _ => refuse(path, "robots follow another store here"),
+        _ => refuse(&path, "robots follow another store here"),
     }
 }

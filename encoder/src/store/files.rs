@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::{self, ManifestError};
 
-use super::error::StoreError;
+use super::StoreError;
 
 pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
 
@@ -40,6 +40,14 @@ impl HashingWriter {
         let file = self.file.into_inner().map_err(io::IntoInnerError::into_error)?;
         file.sync_all()?;
         Ok((Hash32(*self.hasher.finalize().as_bytes()), self.hasher.count()))
+    }
+}
+
+/// `None` for what is not there.
+pub(super) fn if_there<T>(found: io::Result<T>) -> io::Result<Option<T>> {
+    match found {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+        found => found.map(Some),
     }
 }
 
@@ -101,10 +109,7 @@ pub(super) fn read_limited(
     max_bytes: u64,
     too_long: impl FnOnce(u64) -> StoreError,
 ) -> Result<Option<Vec<u8>>, StoreError> {
-    let file = match File::open(path) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-        file => file?,
-    };
+    let Some(file) = if_there(File::open(path))? else { return Ok(None) };
     let mut bytes = Vec::new();
     match file.take(max_bytes + 1).read_to_end(&mut bytes)? as u64 {
         n if n > max_bytes => Err(too_long(n)),
@@ -129,10 +134,7 @@ impl ModelsRecord {
 
     /// An unreadable record counts as absent: the user can still name the models.
     pub(super) fn read(dir: &Path) -> io::Result<Option<Self>> {
-        match fs_err::read(Self::path(dir)) {
-            Ok(bytes) => Ok(serde_json::from_slice(&bytes).ok()),
-            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(e) => Err(e),
-        }
+        let bytes = if_there(fs_err::read(Self::path(dir)))?;
+        Ok(bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()))
     }
 }

@@ -23,8 +23,7 @@ use slag_common::tuf::{
     SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, parse_utc, sign,
 };
 
-use super::error::StoreError;
-use super::{files, reader, roles};
+use super::{StoreError, files, reader, roles};
 
 pub(crate) const TIMESTAMP_FILE: &str = "timestamp.json";
 /// Validity of a timestamp, unless a refresh says otherwise.
@@ -44,7 +43,7 @@ pub(crate) struct Refreshed {
     pub(crate) expires_unix_secs: u64,
 }
 
-type WithBytes<T> = (SignedMetadata<T>, Vec<u8>);
+pub(super) type WithBytes<T> = (SignedMetadata<T>, Vec<u8>);
 
 /// What clients find.
 struct PublishedMetadata {
@@ -52,11 +51,6 @@ struct PublishedMetadata {
     snapshot_meta: FileMeta,
     /// First expiry of targets and snapshot.
     soonest_unix_secs: u64,
-}
-
-pub(super) struct RootFile {
-    pub(crate) root: SignedMetadata<Root>,
-    pub(crate) bytes: Vec<u8>,
 }
 
 pub(crate) struct MetadataReader {
@@ -108,7 +102,7 @@ impl MetadataReader {
 
     /// As [`Self::published`], by the newest root.
     fn published_by_newest(&self) -> Result<Option<PublishedMetadata>, StoreError> {
-        let Some(RootFile { root, .. }) = self.newest_root()? else { return Ok(None) };
+        let Some((root, _)) = self.newest_root()? else { return Ok(None) };
         self.published(&root.body)
     }
 
@@ -185,20 +179,20 @@ impl MetadataReader {
     /// Time at which the timestamp was signed; `None` if not by a key of the newest root, as clients forget it with its
     /// key.
     fn signed_unix_secs(&self) -> Result<Option<u64>, StoreError> {
-        let Some(RootFile { root, .. }) = self.newest_root()? else { return Ok(None) };
+        let Some((root, _)) = self.newest_root()? else { return Ok(None) };
         let timestamp = self.read_signed::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES, &root.body)?;
         Ok(timestamp.and_then(|(timestamp, _)| parse_utc(timestamp.body.signed_at.as_deref()?)))
     }
 
     /// The newest root and its bytes; `None` before the first one.
-    pub(super) fn newest_root(&self) -> Result<Option<RootFile>, StoreError> {
+    pub(super) fn newest_root(&self) -> Result<Option<WithBytes<Root>>, StoreError> {
         let name = format!("{}.root.json", self.next_version(Root::TYPE)? - 1);
         let Some(bytes) = read_file(&self.store, &name, MAX_ROOT_BYTES)? else { return Ok(None) };
         let refuse = |cause| StoreError::Metadata { path: self.path(&name), cause };
         let root = SignedMetadata::<Root>::parse(Root::TYPE, &bytes).map_err(refuse)?;
         // A damaged one must not say which keys count.
         root.check_signatures(Root::TYPE, &root.body.keys, &root.body.roles[Root::TYPE]).map_err(refuse)?;
-        Ok(Some(RootFile { root, bytes }))
+        Ok(Some((root, bytes)))
     }
 
     /// One above the highest version of a role's numbered files.
@@ -252,7 +246,7 @@ impl MetadataReader {
                  timestamp` once, by which robots forget it"
             ));
         }
-        let root = self.newest_root()?.map(|root| root.root.expires_unix_secs);
+        let root = self.newest_root()?.map(|(root, _)| root.expires_unix_secs);
         if let Some(at) = root.filter(|at| *at < now_unix_secs.saturating_add(ROOT_SECS / 10)) {
             warnings.push(expires("root", at, "keys renew"));
         }
@@ -351,7 +345,10 @@ impl Metadata {
         now_unix_secs: u64,
     ) -> Result<(), StoreError> {
         if self.newest_root()?.is_some() {
-            return Err(StoreError::HasRoot { store: self.store.clone() });
+            return Err(StoreError::Failed(format!(
+                "{} has a root already; to change its keys, run `slag-encoder keys rotate` or `revoke`",
+                self.store.display()
+            )));
         }
         if self.is_published()? {
             // Robots trust a root of this store, and a new one of its version would not follow it.
@@ -423,14 +420,11 @@ impl Metadata {
     /// A role's key, if the newest root names it: another one's signature would lock clients out.
     fn key(&self, role: &str) -> Result<SigningKey, StoreError> {
         let wrong = || StoreError::RoleKey { role: role.to_owned(), path: folder(&self.store) };
-        let root = self.newest_root()?.ok_or_else(wrong)?.root;
+        let (root, _) = self.newest_root()?.ok_or_else(wrong)?;
         // A crash after the root was installed may have left the key behind.
         roles::promote(&self.store, role, &root.body)?;
         let key = roles::read(&self.store, role)?;
-        match root.body.roles[role].keyids.contains(&Key::of(&key).id()) {
-            true => Ok(key),
-            false => Err(wrong()),
-        }
+        if root.body.roles[role].keyids.contains(&Key::of(&key).id()) { Ok(key) } else { Err(wrong()) }
     }
 
     pub(super) fn write(&self, name: &str, bytes: &[u8]) -> Result<(), StoreError> {
@@ -477,10 +471,7 @@ fn read_file(store: &Path, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>
 
 /// File names in a store's metadata folder; none without the folder.
 pub(super) fn names(store: &Path) -> io::Result<Vec<String>> {
-    let entries = match fs_err::read_dir(folder(store)) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        entries => entries?,
-    };
+    let Some(entries) = files::if_there(fs_err::read_dir(folder(store)))? else { return Ok(Vec::new()) };
     entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect()
 }
 

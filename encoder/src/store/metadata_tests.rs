@@ -9,7 +9,7 @@ use super::ceremony::{Change, default_root_folder};
 use super::metadata::{
     Metadata, MetadataReader, RELEASE_UNIX_SECS, clock_unix_secs, read_published, signing_time,
 };
-use super::tests::manifest as manifest_of;
+use super::tests::{manifest as manifest_of, new_store};
 use super::{Extras, Store, StoreError};
 
 const DAY: u64 = 86_400;
@@ -25,8 +25,7 @@ impl Source for Folder<'_> {
 }
 
 fn published(now: u64) -> (tempfile::TempDir, Store) {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     publish(&store, 1, now);
     (dir, store)
 }

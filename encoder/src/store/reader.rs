@@ -11,9 +11,8 @@ use slag_common::manifest::{Manifest, ShardRecord, TextModelRecord};
 use slag_common::objects::Objects;
 use slag_common::shard::{ShardLayout, ShardView};
 
-use super::error::StoreError;
-use super::files;
 use super::files::ModelsRecord;
+use super::{StoreError, files};
 
 /// Objects by name that belong to a generation but are not sent to robots.
 pub type Extras = BTreeMap<String, Hash32>;
@@ -35,10 +34,7 @@ impl Published {
         let hash = Hash32::of(&bytes);
         let path = extras_path(dir, hash);
         let damaged = |what| StoreError::Extras { path: path.clone(), what };
-        let extras = match fs_err::read(&path) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged("it is missing".into())),
-            extras => extras?,
-        };
+        let extras = files::if_there(fs_err::read(&path))?.ok_or_else(|| damaged("it is missing".into()))?;
         let extras = serde_json::from_slice(&extras).map_err(|e| damaged(e.to_string()))?;
         Ok(Self { manifest, bytes, hash, extras })
     }
@@ -156,10 +152,11 @@ impl StoreReader {
 
     pub fn read_object(&self, hash: Hash32) -> Result<AlignedBytes, StoreError> {
         let path = self.object_path(hash);
-        let bytes = match AlignedBytes::read(&path) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::ObjectLost { path }),
-            bytes => bytes?,
-        };
+        let bytes = files::if_there(AlignedBytes::read(&path))?;
+        let bytes = bytes.ok_or_else(|| {
+            let path = path.display();
+            StoreError::Failed(format!("{path}: it is missing; encode again, which writes it anew"))
+        })?;
         match Hash32::of(&bytes) {
             found if found == hash => Ok(bytes),
             found => Err(StoreError::ObjectHash { path, found }),

@@ -16,7 +16,7 @@ use ed25519_dalek::SigningKey;
 use slag_common::Hash32;
 use slag_common::tuf::{Body, Key, RoleKeys, Root, generate_key};
 
-use super::error::StoreError;
+use super::StoreError;
 use super::files::{self, Access};
 
 /// Roles whose keys lie with the store.
@@ -49,7 +49,7 @@ pub(super) fn make_all(
 ) -> Result<(Root, Vec<SigningKey>), StoreError> {
     files::ensure_folder(&store.join("keys"))?;
     fs_err::create_dir_all(root_folder)?;
-    let mut root_keys = read_folder(root_folder).map_err(before_root)?;
+    let mut root_keys = read_folder(root_folder, Err).map_err(before_root)?;
     while root_keys.len() < n_root_keys {
         root_keys.push(make_root_key(root_folder)?);
     }
@@ -70,10 +70,12 @@ pub(super) fn make_all(
 
 /// Checks existing keys before the first root.
 pub(super) fn check_before_root(store: &Path) -> Result<(), StoreError> {
-    read_folder(&root_folder(store)).map_err(before_root)?;
+    read_folder(&root_folder(store), Err).map_err(before_root)?;
     let is_damaged = |role: &&str| matches!(KeyFile::read(&key_path(store, role)), Ok(KeyFile::Damaged));
-    let damaged_key = ONLINE.into_iter().find(is_damaged).map(|role| damaged(key_path(store, role)));
-    damaged_key.map_or(Ok(()), |error| Err(before_root(error)))
+    match ONLINE.into_iter().find(is_damaged) {
+        Some(role) => Err(before_root(damaged(key_path(store, role)))),
+        None => Ok(()),
+    }
 }
 
 /// Keys that no root names yet may be made anew.
@@ -88,26 +90,11 @@ fn before_root(error: StoreError) -> StoreError {
 }
 
 /// All root keys in a folder, by name; none without the folder.
-pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
-    read_all(folder, Err)
-}
-
-/// As [`read_folder`], without damaged keys, which are warned of.
-pub(super) fn read_sound(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
-    read_all(folder, |error| {
-        tracing::warn!("{error}");
-        Ok(())
-    })
-}
-
-fn read_all(
+pub(super) fn read_folder(
     folder: &Path,
     on_damage: impl Fn(StoreError) -> Result<(), StoreError>,
 ) -> Result<Vec<SigningKey>, StoreError> {
-    let entries = match fs_err::read_dir(folder) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        entries => entries?,
-    };
+    let Some(entries) = files::if_there(fs_err::read_dir(folder))? else { return Ok(Vec::new()) };
     let mut paths = entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<PathBuf>>>()?;
     paths.retain(|path| path.extension().is_some_and(|extension| extension == "key"));
     paths.sort();
@@ -129,7 +116,7 @@ pub(super) fn make_root_key(folder: &Path) -> Result<SigningKey, StoreError> {
 
 /// Makes a role's next key, unless there is one that can sign.
 pub(super) fn make_next(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
-    let path = next_path(store, role);
+    let path = key_path(store, &format!("{role}.next"));
     if matches!(KeyFile::read(&path)?, KeyFile::Damaged) {
         fs_err::remove_file(&path)?;
     }
@@ -138,15 +125,12 @@ pub(super) fn make_next(store: &Path, role: &str) -> Result<SigningKey, StoreErr
 
 /// Replaces a role's key by its next one, if a root names that.
 pub(super) fn promote(store: &Path, role: &str, root: &Root) -> Result<(), StoreError> {
-    let KeyFile::Key(next) = KeyFile::read(&next_path(store, role))? else { return Ok(()) };
+    let next_path = key_path(store, &format!("{role}.next"));
+    let KeyFile::Key(next) = KeyFile::read(&next_path)? else { return Ok(()) };
     if root.roles[role].keyids.contains(&Key::of(&next).id()) {
-        files::move_into_place(&next_path(store, role), &key_path(store, role))?;
+        files::move_into_place(&next_path, &key_path(store, role))?;
     }
     Ok(())
-}
-
-fn next_path(store: &Path, role: &str) -> PathBuf {
-    store.join("keys").join(format!("{role}.next.key"))
 }
 
 fn key_path(store: &Path, role: &str) -> PathBuf {
@@ -184,10 +168,7 @@ enum KeyFile {
 
 impl KeyFile {
     fn read(path: &Path) -> Result<Self, StoreError> {
-        let file = match fs_err::File::open(path) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Self::Missing),
-            file => file?,
-        };
+        let Some(file) = files::if_there(fs_err::File::open(path))? else { return Ok(Self::Missing) };
         let mut text = String::new();
         match file.take(256).read_to_string(&mut text) {
             Err(e) if e.kind() == io::ErrorKind::InvalidData => return Ok(Self::Damaged),

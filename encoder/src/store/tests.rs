@@ -26,6 +26,12 @@ pub(crate) const DAMAGES: [fn(&Path); 4] = [
     },
 ];
 
+pub(crate) fn new_store() -> (tempfile::TempDir, Store) {
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    (dir, store)
+}
+
 pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
     let cell = |(cell_id, bounds): (usize, &Aabb)| CellRecord {
         cell_id: cell_id as u32,
@@ -89,8 +95,7 @@ fn object_names(store: &Store) -> BTreeSet<String> {
 
 #[test]
 fn published_scene_is_read_back_verified() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     assert!(matches!(StoreReader::open(dir.path()), Err(StoreError::NotPublished { .. })));
     assert_eq!(store.next_generation().expect("records"), 1);
     let shards = put_many(&store, &["a", "bb"]);
@@ -127,8 +132,7 @@ fn second_writer_is_refused_until_the_first_is_gone() {
 
 #[test]
 fn objects_are_named_by_content_and_kept() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let (hash, len_bytes) =
         store.put_object(|out| (0..1000).try_for_each(|i| write!(out, "{i},"))).expect("room");
     let expected: String = (0..1000).map(|i| format!("{i},")).collect();
@@ -165,8 +169,7 @@ fn objects_are_named_by_content_and_kept() {
 
 #[test]
 fn what_is_not_whole_is_not_published() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let shards = put_many(&store, &["a"]);
     let nothing = Hash32::of(b"never put");
     let missing =
@@ -198,8 +201,7 @@ fn what_is_not_whole_is_not_published() {
 
 #[test]
 fn prune_keeps_two_generations_with_their_extras() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let all = put_many(&store, &["s1", "s2", "s3", "f1", "f2", "f3", "loose"]);
     for generation in 1..=3usize {
         let extras = Extras::from([("field".to_owned(), all[2 + generation].0)]);
@@ -243,8 +245,7 @@ fn records_behind_the_manifest_are_repaired() {
 #[test]
 fn publication_that_fails_on_its_way_changes_nothing() {
     for obstacle in ["extras", "manifest.previous"] {
-        let dir = tempfile::tempdir().expect("temporary folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
+        let (dir, store) = new_store();
         let shards = put_many(&store, &["a", "b"]);
         let hash = store.publish(&manifest(1, &shards[..1]), &Extras::new()).expect("publishes");
         // A file cannot be written below a file, nor renamed onto a folder that is not empty.
@@ -325,8 +326,7 @@ fn killed_writer_leaves_a_whole_generation() {
 /// A damaged record of extras hides what robots do not need: it must not keep the next encode from repairing it.
 #[test]
 fn damaged_extras_do_not_keep_a_writer_out() {
-    let dir = tempfile::tempdir().expect("a folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let object = store.put_bytes(b"shard").expect("puts");
     let hash = store.publish(&manifest(1, &[object]), &Extras::new()).expect("publishes");
     drop(store);
@@ -342,8 +342,7 @@ fn damaged_extras_do_not_keep_a_writer_out() {
 /// A record of another encoder, from an interrupted encode, says nothing of what is published.
 #[test]
 fn models_are_remembered_for_their_encoder_alone() {
-    let dir = tempfile::tempdir().expect("a folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (_dir, store) = new_store();
     let manifest = manifest(1, &[]);
     store.publish(&manifest, &Extras::new()).expect("publishes");
     let models = || store.reader().expect("reads").models().expect("reads");
@@ -357,8 +356,7 @@ fn models_are_remembered_for_their_encoder_alone() {
 
 #[test]
 fn verification_reads_every_byte_and_names_what_is_bad() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let all = put_many(&store, &["shard one", "shard two", "field", "unlisted"]);
     let extras = Extras::from([("field".to_owned(), all[2].0)]);
     store.publish(&manifest(1, &all[..1]), &extras).expect("publishes");
@@ -366,7 +364,7 @@ fn verification_reads_every_byte_and_names_what_is_bad() {
     let verify = || {
         let n_read = std::sync::atomic::AtomicU64::new(0);
         let reader = store.reader().expect("published");
-        let verified = reader.listing().verify(|| {
+        let verified = reader.verify(|| {
             n_read.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         });
         assert_eq!((verified.n_files, n_read.into_inner()), (3, 3));
@@ -389,8 +387,7 @@ fn verification_reads_every_byte_and_names_what_is_bad() {
 #[test]
 fn a_damaged_manifest_is_published_anew() {
     for (number, damage) in DAMAGES.iter().enumerate() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
+        let (dir, store) = new_store();
         for generation in 1..=2 {
             store.publish(&manifest(generation, &[]), &Extras::new()).expect("publishes");
         }
@@ -407,15 +404,14 @@ fn a_damaged_manifest_is_published_anew() {
         let reader = store.reader().expect("whole");
         let previous = reader.previous().expect("readable").manifest.generation;
         assert_eq!((reader.manifest().generation, previous), (3, 1), "damage {number}");
-        assert!(reader.listing().verify(|| {}).bad.is_empty(), "damage {number}");
+        assert!(reader.verify(|| {}).bad.is_empty(), "damage {number}");
     }
 }
 
 /// What another version wrote is no damage, and is not overwritten.
 #[test]
 fn a_manifest_of_another_version_is_kept() {
-    let dir = tempfile::tempdir().expect("a folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     store.publish(&manifest(1, &[]), &Extras::new()).expect("publishes");
     drop(store);
     let path = dir.path().join("manifest");
@@ -522,4 +518,26 @@ fn an_export_replaces_nothing_else() {
     let refused = export(other.path(), out.path()).expect_err("another root").to_string();
     assert!(refused.contains("1.root.json: robots follow another store here"), "{refused}");
     export(dir.path(), out.path()).expect("the same store");
+}
+
+/// A full or read-only disk is no damaged database.
+#[test]
+fn advice_fits_the_fault_of_the_disk() {
+    let said = |error: io::Error| {
+        let path = PathBuf::from("db");
+        let of_files = StoreError::Io(io::Error::new(error.kind(), error.to_string())).to_string();
+        (of_files, StoreError::Records { path, cause: sled::Error::Io(error) }.to_string())
+    };
+    for (error, expected) in [
+        (io::Error::from(io::ErrorKind::StorageFull), "free space"),
+        (io::Error::other("No space left on device (os error 28)"), "free space"),
+        (io::Error::from(io::ErrorKind::PermissionDenied), "the right to read and write"),
+        (io::Error::from(io::ErrorKind::ReadOnlyFilesystem), "takes no writes"),
+    ] {
+        let (of_files, of_records) = said(error);
+        assert!(of_files.contains(expected) && of_records.contains(expected), "{of_files}; {of_records}");
+        assert!(!of_records.contains("remove this folder"), "{of_records}");
+    }
+    let (_, damaged) = said(io::Error::from(io::ErrorKind::InvalidData));
+    assert!(damaged.contains("remove this folder"), "{damaged}");
 }

@@ -8,7 +8,7 @@ use super::ceremony::{Change, default_root_folder};
 use super::metadata::{Metadata, clock_unix_secs};
 use super::metadata_tests::{client, follow, publish_in as publish};
 use super::tests::DAMAGES;
-use super::{Fault, StoreError, StoreReader, export, walk};
+use super::{Fault, StoreError, StoreReader, export, verify};
 
 /// A store with two generations and two roots, and a refreshed timestamp.
 fn store() -> tempfile::TempDir {
@@ -37,7 +37,7 @@ fn newest(dir: &Path, role: &str) -> PathBuf {
 #[test]
 fn what_robots_would_refuse_is_told() {
     let sound = store();
-    assert_eq!(walk::refused(sound.path()).expect("reads"), []);
+    assert_eq!(verify::refused(sound.path()).expect("reads"), []);
     let roles = ["timestamp", "snapshot", "targets", "root"];
     let mut paths: Vec<PathBuf> = roles.map(|role| newest(sound.path(), role)).into();
     paths.push(sound.path().join("metadata/1.root.json"));
@@ -47,7 +47,7 @@ fn what_robots_would_refuse_is_told() {
             damage(path);
             let case = format!("{}, damage {number}", path.display());
             let reader = StoreReader::open(sound.path()).expect("published");
-            let bad = reader.listing().verify(|| {}).bad;
+            let bad = reader.verify(|| {}).bad;
             assert_eq!(bad.len(), 1, "{case}: {bad:?}");
             // A missing newest root shows in what its keys signed.
             let is_gone_root = number == 0 && path.ends_with("2.root.json");
@@ -66,7 +66,7 @@ fn what_robots_would_refuse_is_told() {
     let manifest = sound.path().join("manifest");
     let older = fs_err::read(sound.path().join("manifest.previous")).expect("there");
     fs_err::write(&manifest, older).expect("written");
-    let [refused] = &walk::refused(sound.path()).expect("reads")[..] else { panic!("one") };
+    let [refused] = &verify::refused(sound.path()).expect("reads")[..] else { panic!("one") };
     assert_eq!(refused.path, manifest);
 }
 
@@ -90,7 +90,7 @@ fn metadata_is_signed_anew_and_no_version_goes_back() {
                     ),
                     false => publish(dir.path(), 3).unwrap_or_else(|e| panic!("{case}: {e}")),
                 }
-                assert_eq!(walk::refused(dir.path()).expect("reads"), [], "{case}");
+                assert_eq!(verify::refused(dir.path()).expect("reads"), [], "{case}");
                 let after = follow(&mut kept, dir.path(), clock_unix_secs()).expect("follows");
                 let versions = |trusted: &Trusted| {
                     let [timestamp, snapshot, targets] = [

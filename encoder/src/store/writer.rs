@@ -11,11 +11,10 @@ use slag_common::Hash32;
 use slag_common::manifest::{Manifest, ManifestError};
 
 use super::catalogue::Catalogue;
-use super::error::{StoreError, manifest_fault};
 use super::files::{self, Access, HashingWriter, ModelsRecord};
 use super::metadata::Metadata;
 use super::reader::{self, Extras, Published, StoreReader};
-use super::verify;
+use super::{StoreError, manifest_fault, verify};
 
 /// sled releases the lock of a writer that has just ended on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);
@@ -293,34 +292,20 @@ impl Store {
 }
 
 /// Names in a store's folder, and of what a new disk has.
-const NAMES: [&str; 13] = [
-    "objects",
-    "metadata",
-    "extras",
-    "keys",
-    "tmp",
-    "db",
-    "db.damaged",
-    "job",
-    "drawn",
-    "models.json",
-    files::MANIFEST,
-    files::MANIFEST_PREVIOUS,
-    "lost+found",
-];
+const NAMES: &str = "objects metadata extras keys tmp db db.damaged job drawn models.json manifest manifest.previous lost+found";
 
 /// Refuses a folder with files that are none of a store's. A store, published or only begun, may have others besides.
 pub(crate) fn check_folder(dir: &Path) -> Result<(), StoreError> {
-    let entries = match fs_err::read_dir(dir) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-        entries => entries?,
-    };
+    let Some(entries) = files::if_there(fs_err::read_dir(dir))? else { return Ok(()) };
     let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
     let names = names.collect::<io::Result<BTreeSet<String>>>()?;
     let is_store = names.contains("objects") && (names.contains("extras") || names.contains("db"));
-    let mut others = names.iter().filter(|name| !NAMES.contains(&name.as_str()));
+    let mut others = names.iter().filter(|name| !NAMES.split(' ').any(|known| known == *name));
     match others.next() {
-        Some(found) if !is_store => Err(StoreError::NotAStore { path: dir.to_owned(), found: found.clone() }),
+        Some(found) if !is_store => Err(StoreError::Failed(format!(
+            "{}: it is no store and has other files, the first is {found:?}; name a store, or a folder that is empty or new",
+            dir.display()
+        ))),
         _ => Ok(()),
     }
 }

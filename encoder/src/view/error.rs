@@ -5,7 +5,7 @@ use slag_models::InferenceError;
 use slag_service::problem::Problem;
 
 use crate::diff::DiffError;
-use crate::lift::published::ReadFieldError;
+use crate::lift::field::ReadFieldError;
 use crate::store::StoreError;
 
 #[derive(Debug, thiserror::Error)]

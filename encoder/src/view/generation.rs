@@ -9,7 +9,7 @@ use super::answers::Things;
 use super::error::ViewError;
 use super::shards::{combined, photos_of, scores_of, smallest_shard, smallest_with_appearance};
 use super::splat::{PROGRAM, Splat};
-use crate::lift::published::{read_field, read_regions};
+use crate::lift::field::{read_field, read_regions};
 use crate::lift::{CellField, RegionTable};
 use crate::store::{StoreReader, StoredShard};
 

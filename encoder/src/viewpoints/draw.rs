@@ -7,9 +7,8 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec3};
 use image::{DynamicImage, ImageError, ImageFormat, Rgb, RgbImage};
 use rayon::prelude::*;
-use serde::Serialize;
 use serde_json::{Value, json};
-use slag_common::photo::{self, PhotoError};
+use slag_common::photo;
 use slag_common::{Gaussians, Intrinsics, durable, npy};
 
 use super::looks::pinhole;
@@ -28,18 +27,15 @@ const REACH_PX: i64 = 3;
 
 #[derive(Debug, thiserror::Error)]
 pub enum DrawError {
-    #[error("view {view}: {source}")]
-    Raster { view: String, source: RasterError },
     #[error(transparent)]
     Scene(#[from] RasterError),
     #[error(transparent)]
     Io(#[from] io::Error),
     #[error("a drawing as PNG: {0}")]
     Image(#[from] ImageError),
-    #[error("{}: this was not drawn by slag-encoder, so it is not replaced; name another folder, or move it away", path.display())]
-    Foreign { path: PathBuf },
-    #[error("{}: {fault}", path.display())]
-    Drawn { path: PathBuf, fault: PhotoError },
+    /// Of a view or a file, which it names.
+    #[error("{0}")]
+    Failed(String),
 }
 
 /// A view to draw, with its file name below `images/`.
@@ -53,8 +49,7 @@ pub struct DrawnView {
 
 /// Views of a plan, named in its order.
 pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
-    let [width_px, height_px] = SIZE_PX;
-    let intrinsics = pinhole(width_px, height_px);
+    let intrinsics = pinhole(SIZE_PX);
     let view = |(number, viewpoint): (usize, &Viewpoint)| DrawnView {
         name: format!("drawn-{number:04}.png"),
         view: RasterView { camera_from_world: viewpoint.camera_from_world, intrinsics },
@@ -72,13 +67,16 @@ pub(crate) fn check_folder(folder: &Path) -> Result<(), DrawError> {
     let has_files = |path: &PathBuf| fs_err::read_dir(path).is_ok_and(|mut found| found.next().is_some());
     let images = ["images", "depth", "coverage"].map(|name| folder.join(name)).into_iter().find(has_files);
     match images.or_else(|| poses.exists().then_some(poses)) {
-        Some(path) => Err(DrawError::Foreign { path }),
+        Some(path) => Err(DrawError::Failed(format!(
+            "{}: this was not drawn by slag-encoder, so it is not replaced; name another folder, or move it away",
+            path.display()
+        ))),
         None => Ok(()),
     }
 }
 
-/// Draws views into `images/` of a folder, `with_depth` also into the files of [`Measured`], then writes the poses
-/// file. `drawn_from`: the splat, as the poses file names it.
+/// Draws views into `images/` of a folder, `with_depth` also their arrays, then writes the poses file. `drawn_from`: the
+/// splat, as the poses file names it.
 pub fn draw(
     folder: &Path,
     views: &mut [DrawnView],
@@ -90,47 +88,28 @@ pub fn draw(
     begin(folder, drawn_from)?;
     draw_images(folder, views, scene, progress, |view, drawing, _| {
         if with_depth {
-            Measured::of(view).write(folder, &drawing)?;
+            let shape = [drawing.height_px as usize, drawing.width_px as usize];
+            for (of, values) in [("depth", &drawing.depth), ("coverage", &drawing.coverage)] {
+                let path = folder.join(array_file(view, of));
+                path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
+                npy::write_file(&path, &shape, values)?;
+            }
         }
         Ok(drawing.image())
     })?;
     if with_depth {
         for view in &mut *views {
-            let measured = json!(Measured::of(view));
-            extend(&mut view.about, measured);
+            // Camera z in the splat's units (nerfstudio's name), 0 where no Gaussian is; and the splat's opacity, 0 to 1.
+            let [depth, coverage] = ["depth", "coverage"].map(|of| array_file(view, of));
+            extend(&mut view.about, json!({ "depth_file_path": depth, "coverage_file_path": coverage }));
         }
     }
     write_poses(folder, views, drawn_from, json!({}))
 }
 
-/// The arrays of a drawing: `.npy` files of 32-bit floats, `[height][width]`. The poses file has these members.
-#[derive(Serialize)]
-struct Measured {
-    /// Camera z in the splat's units (nerfstudio's name); 0 where no Gaussian is.
-    depth_file_path: PathBuf,
-    /// Opacity of the splat, 0 to 1.
-    coverage_file_path: PathBuf,
-}
-
-impl Measured {
-    fn of(view: &DrawnView) -> Self {
-        let name = Path::new(&view.name).with_extension("npy");
-        Self {
-            depth_file_path: Path::new("depth").join(&name),
-            coverage_file_path: Path::new("coverage").join(&name),
-        }
-    }
-
-    fn write(&self, folder: &Path, drawing: &Drawing) -> Result<(), DrawError> {
-        let shape = [drawing.height_px as usize, drawing.width_px as usize];
-        let files = [(&self.depth_file_path, &drawing.depth), (&self.coverage_file_path, &drawing.coverage)];
-        for (path, values) in files {
-            let path = folder.join(path);
-            path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
-            npy::write_file(&path, &shape, values)?;
-        }
-        Ok(())
-    }
+/// Of a view's array of 32-bit floats, `[height][width]`, below the folder.
+fn array_file(view: &DrawnView, of: &str) -> PathBuf {
+    Path::new(of).join(&view.name).with_extension("npy")
 }
 
 /// As [`draw`], sharpened by how much views blur as the Gaussians grow; small Gaussians change little. `about`: further
@@ -168,7 +147,7 @@ fn begin(folder: &Path, drawn_from: &str) -> Result<(), DrawError> {
 fn read(path: &Path) -> Result<RgbImage, DrawError> {
     let input = BufReader::new(fs_err::File::open(path)?);
     let read = photo::open(input).and_then(|decoder| Ok(DynamicImage::from_decoder(decoder)?.into_rgb8()));
-    read.map_err(|fault| DrawError::Drawn { path: path.to_owned(), fault })
+    read.map_err(|fault| DrawError::Failed(format!("{}: {fault}", path.display())))
 }
 
 /// Writes each view's drawing as `finish` makes it, which gets the file to replace.
@@ -181,7 +160,7 @@ fn draw_images(
 ) -> Result<(), DrawError> {
     progress.begin("draw", "view", views.len() as u64, 0);
     let draw_one = |view: &DrawnView| {
-        let failed = |source| DrawError::Raster { view: view.name.clone(), source };
+        let failed = |source| DrawError::Failed(format!("view {}: {source}", view.name));
         let drawing = scene.draw(&view.view, BACKGROUND).map_err(failed)?;
         let path = folder.join("images").join(&view.name);
         path.parent().map_or(Ok(()), fs_err::create_dir_all)?;

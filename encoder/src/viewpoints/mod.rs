@@ -1,6 +1,5 @@
 //! Viewpoints: where to draw a splat that has no photos, from its Gaussians alone.
 
-mod candidates;
 mod draw;
 mod looks;
 mod plan;
@@ -23,7 +22,7 @@ use space::Space;
 pub(crate) use draw::check_folder;
 pub(crate) use draw::{DrawError, DrawnView, views_of};
 pub use draw::{POSES_FILE, draw, draw_sharpened};
-pub(crate) use plan::{Fault, Viewpoint};
+pub(crate) use plan::Viewpoint;
 pub use plan::{SceneKind, Verdict, ViewpointError, ViewpointPlan, ViewpointSettings};
 
 /// Default number of views: twice as many gain 1 % of average precision.
@@ -56,44 +55,51 @@ pub fn plan(
     memory_bytes: u64,
     cancel: &AtomicBool,
 ) -> Result<ViewpointPlan, ViewpointError> {
+    let refused = ViewpointError::Refused;
     let stride = (scene.len() / ENOUGH_GAUSSIANS).clamp(1, MAX_STRIDE);
     // Columns of means, rotations, scales, opacities and colours, and the candidates' looks.
     let mut memory = MemoryPlan::new(memory_bytes);
     memory.reserve(Phase::Always, "the scene with its colours", scene.len_bytes());
     let thin_bytes = Gaussians::decoded_bytes(scene.len() / stride, 0) as u64;
     memory.reserve(Phase::Views, "Gaussians that views are planned by", 3 * thin_bytes);
-    memory.reserve(Phase::Views, "what planned views show", candidates::MOST as u64 * looks::LOOK_BYTES);
+    memory.reserve(Phase::Views, "what planned views show", looks::MOST as u64 * looks::LOOK_BYTES);
     memory.rest(0)?;
-    let thin = space::thinned(scene, stride)?;
+    let grown = (stride as f32).sqrt();
+    let thin = space::thinned(scene, stride, grown)?;
     let up = match settings.up {
         Some(up) => {
-            up::Up { axis: up.try_normalize().ok_or(ViewpointError::BadUp(up))?, sign: up::Sign::Known }
+            let wrong = || refused(format!("--up {up}: expected three finite numbers, not all 0"));
+            up::Up { axis: up.try_normalize().ok_or_else(wrong)?, sign: up::Sign::Known }
         }
-        None => up::find(&thin.scene),
+        None => up::find(&thin),
     };
-    let mut space = Space::new(&thin, up.axis);
+    let mut space = Space::new(&thin, grown, up.axis);
     if up.sign == up::Sign::Unknown && large_from_above(&space, rasterizer)? {
-        space = Space::new(&thin, -up.axis);
+        space = Space::new(&thin, grown, -up.axis);
     }
-    let mut kind = candidates::kind_of(&space);
+    let mut kind = looks::kind_of(&space);
     let mut looked = look_at_all(&space, rasterizer, kind, cancel)?;
     // A ball has no floor, and no place within; a room full of floaters has a floor.
     let is_solid = up.sign == up::Sign::Assumed && looked.len() < MIN_GOOD;
     if is_solid || is_object(&looked, &space, kind) {
         if up.sign != up::Sign::Known {
-            space = Space::new(&thin, up::OF_FILES);
+            space = Space::new(&thin, grown, up::OF_FILES);
         }
         kind = SceneKind::Object;
         looked = look_at_all(&space, rasterizer, kind, cancel)?;
     } else if up.sign == up::Sign::Assumed {
-        return Err(ViewpointError::NoUp);
+        let advice = "give it with --up X,Y,Z, for example --up 0,0,1 where z points up";
+        return Err(refused(format!("the Gaussians do not tell which way is up; {advice}")));
     }
     let n_candidates = looked.len();
     let (good, bad): (Vec<Look>, Vec<Look>) =
         looked.into_iter().partition(|look| look.verdict.fault(kind).is_none());
     if good.len() < MIN_GOOD.min(settings.n_views) {
         let (n_good, faults) = (good.len(), faults(&bad, kind));
-        return Err(ViewpointError::FewViews { kind, n_good, n_candidates, faults });
+        return Err(refused(format!(
+            "only {n_good} of {n_candidates} planned views of this {kind} scene can be trusted ({faults}); give photos with \
+             --views, remove floaters from the splat, or state its upward direction with --up X,Y,Z"
+        )));
     }
     let (chosen, seen) = greedy(&good, space.scene.len(), settings.n_views);
     let views = chosen.into_iter().map(|at| Viewpoint {
@@ -117,7 +123,7 @@ fn look_at_all(
     cancel: &AtomicBool,
 ) -> Result<Vec<Look>, ViewpointError> {
     let loaded = rasterizer.load(&space.scene)?;
-    let looked = candidates::of(kind, space).into_par_iter().map(|camera| {
+    let looked = looks::of(kind, space).into_par_iter().map(|camera| {
         if cancel.load(Ordering::Relaxed) {
             return Err(ViewpointError::Interrupted);
         }
@@ -126,7 +132,7 @@ fn look_at_all(
     looked.collect::<Vec<_>>().into_iter().collect()
 }
 
-fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
+fn n_with(looked: &[Look], kind: SceneKind, fault: Option<&str>) -> usize {
     looked.iter().filter(|look| look.verdict.fault(kind) == fault).count()
 }
 
@@ -134,12 +140,12 @@ fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
 /// other way to look at it.
 fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
     let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
-    2 * n_with(looked, kind, Some(Fault::Holes)) > looked.len()
+    2 * n_with(looked, kind, Some(plan::HOLES)) > looked.len()
         && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
 }
 
 fn faults(bad: &[Look], kind: SceneKind) -> String {
-    let all = Fault::ALL.map(|fault| (fault, n_with(bad, kind, Some(fault))));
+    let all = plan::FAULTS.map(|fault| (fault, n_with(bad, kind, Some(fault))));
     let told = all.iter().filter(|(_, n)| *n > 0).map(|(fault, n)| format!("{n} {fault}"));
     told.collect::<Vec<_>>().join(", ")
 }

@@ -60,21 +60,9 @@ pub enum ViewpointError {
     Raster(#[from] RasterError),
     #[error(transparent)]
     Memory(#[from] MemoryError),
-    #[error(
-        "no views can be planned: {n} Gaussians are opaque and finite, expected at least {expected}; give photos with --views"
-    )]
-    Empty { n: usize, expected: usize },
-    #[error(
-        "the Gaussians do not tell which way is up; give it with --up X,Y,Z, for example --up 0,0,1 where z points up"
-    )]
-    NoUp,
-    #[error("--up {0}: expected three finite numbers, not all 0")]
-    BadUp(DVec3),
-    #[error(
-        "only {n_good} of {n_candidates} planned views of this {kind} scene can be trusted ({faults}); give photos with --views, \
-         remove floaters from the splat, or state its upward direction with --up X,Y,Z"
-    )]
-    FewViews { kind: SceneKind, n_good: usize, n_candidates: usize, faults: String },
+    /// Why, and what to give.
+    #[error("{0}")]
+    Refused(String),
     #[error("interrupted while views were planned; run the same command again")]
     Interrupted,
 }
@@ -118,39 +106,17 @@ pub struct Verdict {
     pub large: f32,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Fault {
-    Holes,
-    Near,
-    Haze,
-    Large,
-}
-
-impl Fault {
-    pub(super) const ALL: [Self; 4] = [Self::Holes, Self::Near, Self::Haze, Self::Large];
-}
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Holes => "look into holes",
-            Self::Near => "are too near to something",
-            Self::Haze => "look through haze",
-            Self::Large => "show no detail",
-        })
-    }
-}
+/// What is wrong with views, for people.
+pub(super) const FAULTS: [&str; 4] =
+    [HOLES, "are too near to something", "look through haze", "show no detail"];
+pub(super) const HOLES: &str = "look into holes";
 
 impl Verdict {
-    /// `None` if the view is good.
-    pub fn fault(&self, kind: SceneKind) -> Option<Fault> {
+    /// Why the view is no good; `None` if it is.
+    pub fn fault(&self, kind: SceneKind) -> Option<&'static str> {
         let holes = if kind == SceneKind::Object { MAX_HOLES_OF_OBJECT } else { MAX_HOLES };
-        let limits = [
-            (self.holes, holes, Fault::Holes),
-            (self.near, MAX_NEAR, Fault::Near),
-            (self.haze, MAX_HAZE, Fault::Haze),
-            (self.large, MAX_LARGE, Fault::Large),
-        ];
-        limits.into_iter().find(|(found, limit, _)| found > limit).map(|(.., fault)| fault)
+        let found = [self.holes, self.near, self.haze, self.large];
+        let limits = [holes, MAX_NEAR, MAX_HAZE, MAX_LARGE];
+        (0..4).find(|at| found[*at] > limits[*at]).map(|at| FAULTS[at])
     }
 }

@@ -32,17 +32,9 @@ pub(super) struct Space {
     occupied: Vec<bool>,
 }
 
-/// Some of a scene's Gaussians, without colours, enlarged so that surfaces stay closed.
-pub(super) struct Thinned {
-    pub(super) scene: Gaussians,
-    /// Factor by which Gaussians are enlarged.
-    grown: f32,
-}
-
-/// Takes every n-th usable Gaussian.
-pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Result<Thinned, ViewpointError> {
+/// Every n-th usable Gaussian, without colours, enlarged so that surfaces stay closed.
+pub(super) fn thinned(scene: &Gaussians, stride: usize, grown: f32) -> Result<Gaussians, ViewpointError> {
     let mut thin = Gaussians::default();
-    let grown = (stride as f32).sqrt();
     for i in (0..scene.len()).filter(|i| scene.is_usable(*i)).step_by(stride) {
         thin.means_in_world.push(scene.means_in_world[i]);
         thin.rotations_wxyz.push(scene.rotations_wxyz[i]);
@@ -52,15 +44,17 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Result<Thinned, Viewp
     }
     let n_solid = up::solid(&thin).count();
     if n_solid < MIN_GAUSSIANS {
-        return Err(ViewpointError::Empty { n: n_solid, expected: MIN_GAUSSIANS });
+        return Err(ViewpointError::Refused(format!(
+            "no views can be planned: {n_solid} Gaussians are opaque and finite, expected at least {MIN_GAUSSIANS}; give photos \
+             with --views"
+        )));
     }
-    Ok(Thinned { scene: thin, grown })
+    Ok(thin)
 }
 
 impl Space {
-    /// Converts a scene to the planner's axes, and finds its occupied voxels.
-    pub(super) fn new(thin: &Thinned, up: DVec3) -> Self {
-        let Thinned { scene: world, grown } = thin;
+    /// Converts a scene, enlarged by a factor, to the planner's axes, and finds its occupied voxels.
+    pub(super) fn new(world: &Gaussians, grown: f32, up: DVec3) -> Self {
         let x_axis = longest_side(world, up);
         let axes = [x_axis, up.cross(x_axis), up];
         let ranges = axes.map(|axis| up::extent(world, axis).unwrap_or_default());
@@ -85,7 +79,7 @@ impl Space {
         };
         let half = 0.5 * size / scale;
         let n = half.to_array().map(|h| (2.0 * (h / VOXEL + MARGIN)).ceil() as usize);
-        let (grown, occupied) = (*grown, Vec::new());
+        let occupied = Vec::new();
         let mut space =
             Self { scene, grown, half, plan_from_world, centre_in_world: centre, scale, n, occupied };
         space.occupied = space.occupied();

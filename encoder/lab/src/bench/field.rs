@@ -6,14 +6,14 @@ use std::path::Path;
 use anyhow::Result;
 use glam::DVec3;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use slag_common::shard::Profile;
+use slag_common::shard::{Additions, Profile};
 use slag_common::{Gaussians, Hash32};
 
 use super::embeddings::{Field, place_in_cube};
 use slag_encoder::cells::{CellLimits, PositionError, split};
 use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext};
 use slag_encoder::progress::Progress;
-use slag_encoder::shard::{CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
+use slag_encoder::shard::{CellEmbeddings, ShardBuilder, ShardSettings};
 use slag_encoder::store::{Extras, Store};
 use slag_math::matrix::Rows;
 
@@ -52,7 +52,7 @@ pub(super) fn publish(
         let cell_id = cell_id as u32;
         let builder =
             ShardBuilder { scene: &scene, encoder_id: id, score_context: &context, settings: &settings };
-        let built = builder.build(cell_id, cell, &embeddings, CellExtras::default());
+        let built = builder.build(cell_id, cell, &embeddings, None, Additions::default());
         let mut shards = BTreeMap::new();
         for made in &built.shards {
             let (hash, len_bytes) = store.put_bytes(&made.bytes)?;

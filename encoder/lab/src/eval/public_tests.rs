@@ -77,7 +77,7 @@ impl Wall {
         let mut settings = EncodeSettings::new(scene, views.clone(), dir.path().join("store"), true);
         settings.view.masks = Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() };
         settings.view.min_mask_px = 10;
-        settings.aggregation = Aggregation::PLAIN;
+        settings.aggregation = Aggregation::default();
         settings.cells.limits = CellLimits::by_count(4096);
         settings.cells.shards.profiles = vec![Profile::Compact];
         settings.cells.objects = false;

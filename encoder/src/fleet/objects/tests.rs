@@ -6,11 +6,10 @@ use super::*;
 fn a_view_comes_back_and_a_cut_one_is_refused() {
     let record = ViewRecord { raster_width_px: 640, secs: 0.25 };
     let bytes = pack_view(record, b"outlines", b"contributions").expect("packs");
-    let found = ViewObject::read(&bytes).expect("whole");
-    assert_eq!(found.record, record);
-    assert_eq!((found.outlines(), found.contributions()), (&b"outlines"[..], &b"contributions"[..]));
+    let (found, outlines, contributions) = unpack_view(&bytes).expect("whole");
+    assert_eq!((found, &outlines[..], &contributions[..]), (record, &b"outlines"[..], &b"contributions"[..]));
     for cut in 0..bytes.len() {
-        assert!(ViewObject::read(&bytes[..cut]).is_err(), "{cut}");
+        assert!(unpack_view(&bytes[..cut]).is_err(), "{cut}");
     }
 }
 

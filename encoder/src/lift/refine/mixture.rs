@@ -22,65 +22,41 @@ const FILLED_WEIGHT_PX: f32 = 1e-3;
 /// Direction of each of a part's Gaussians, in 8 bits; zeros without evidence.
 pub(super) fn sketches(contributions: &PartContributions, region_points: &[Point]) -> Vec<[i8; AXES]> {
     let sketch_of = |k: usize| -> [i8; AXES] {
-        let mut sum = sum_of(contributions, contributions.entries_of(k), region_points);
+        let mut sum = sum_of(contributions, k, region_points);
         make_unit(&mut sum);
         sum.map(|c| (127.0 * c).round() as i8)
     };
     (0..contributions.part.locals.len()).into_par_iter().map(sketch_of).collect()
 }
 
-/// A part's summed contributions by superpoint: `(superpoint, [(region, weight)])`.
-pub(super) struct PartSums(Vec<(usize, Vec<(u32, f32)>)>);
+/// Contributions by region, `(region, weight)`.
+pub(super) type Sums = Vec<(u32, f32)>;
 
-impl PartSums {
-    /// `gaussians`: scene indices of the part's Gaussians.
-    pub(super) fn new(
-        contributions: &PartContributions,
-        gaussians: &[u32],
-        superpoints: &Superpoints,
-    ) -> Self {
-        let superpoint_of = |k: u32| superpoints.of_gaussian[gaussians[k as usize] as usize];
-        // By superpoint, then by Gaussian.
-        let mut members: Vec<(u32, u32)> = (0..gaussians.len() as u32)
-            .into_par_iter()
-            .map(|k| (superpoint_of(k), k))
-            .filter(|(superpoint, _)| *superpoint != NO_SUPERPOINT)
-            .collect();
-        members.par_sort_unstable();
-        let of_superpoint = |members: &[(u32, u32)]| -> (usize, Vec<(u32, f32)>) {
-            let mut entries = Vec::new();
-            for (_, k) in members {
-                let of_gaussian = contributions.entries_of(*k as usize);
-                let regions = contributions.regions[of_gaussian.clone()].iter().copied();
-                entries.extend(regions.zip(contributions.weights[of_gaussian].iter().copied()));
-            }
-            (members[0].0 as usize, summed_by_key(entries))
-        };
-        let runs: Vec<&[(u32, u32)]> = members.chunk_by(|a, b| a.0 == b.0).collect();
-        Self(runs.into_par_iter().map(of_superpoint).collect())
-    }
+/// A part's summed contributions, by superpoint. `gaussians`: scene indices of the part's Gaussians.
+pub(super) fn part_sums(
+    contributions: &PartContributions,
+    gaussians: &[u32],
+    superpoints: &Superpoints,
+) -> Vec<(usize, Sums)> {
+    let superpoint_of = |k: u32| superpoints.of_gaussian[gaussians[k as usize] as usize];
+    // By superpoint, then by Gaussian.
+    let mut members: Vec<(u32, u32)> = (0..gaussians.len() as u32)
+        .into_par_iter()
+        .map(|k| (superpoint_of(k), k))
+        .filter(|(superpoint, _)| *superpoint != NO_SUPERPOINT)
+        .collect();
+    members.par_sort_unstable();
+    let of_superpoint = |members: &[(u32, u32)]| -> (usize, Sums) {
+        let entries = members.iter().flat_map(|(_, k)| contributions.entries(*k as usize));
+        (members[0].0 as usize, summed_by_key(entries.collect()))
+    };
+    let runs: Vec<&[(u32, u32)]> = members.chunk_by(|a, b| a.0 == b.0).collect();
+    runs.into_par_iter().map(of_superpoint).collect()
 }
 
-/// Summed contributions of each superpoint so far: `(region, weight)`, one run a part.
-pub(super) struct SuperpointSums(Vec<Vec<(u32, f32)>>);
-
-impl SuperpointSums {
-    /// Bytes of a partition's sums of `n_entries` contributions.
-    pub(super) fn len_bytes(n_entries: u64) -> u64 {
-        n_entries / ENTRIES_PER_SUM * size_of::<(u32, f32)>() as u64
-    }
-
-    pub(super) fn new(n_superpoints: usize) -> Self {
-        Self(vec![Vec::new(); n_superpoints])
-    }
-
-    pub(super) fn add(&mut self, of_part: PartSums) {
-        for (superpoint, entries) in of_part.0 {
-            let sum = &mut self.0[superpoint];
-            // Most superpoints lie within one part.
-            if sum.is_empty() { *sum = entries } else { sum.extend(entries) }
-        }
-    }
+/// Bytes of a partition's sums of `n_entries` contributions.
+pub(super) fn sums_bytes(n_entries: u64) -> u64 {
+    n_entries / ENTRIES_PER_SUM * size_of::<(u32, f32)>() as u64
 }
 
 /// Sums values by key, ascending by key.
@@ -116,11 +92,11 @@ pub(super) struct Mixtures {
 }
 
 impl Mixtures {
-    /// Appends a region for each superpoint with evidence.
+    /// Appends a region for each superpoint with evidence. `sums`: of each superpoint, one run a part.
     pub(super) fn new(
         weight: f32,
         superpoints: Superpoints,
-        sums: SuperpointSums,
+        sums: Vec<Sums>,
         table: &mut RegionTable,
         mask_points: &[Point],
     ) -> Result<Self, ContributionError> {
@@ -143,7 +119,7 @@ impl Mixtures {
             mixture.iter().for_each(|(mask, share)| add(&mut sum, *share, &mask_points[*mask as usize]));
             (mixture, length(&sum))
         };
-        let mixtures: Vec<(Vec<(u32, f32)>, f32)> = sums.0.into_par_iter().map(with_length).collect();
+        let mixtures: Vec<(Vec<(u32, f32)>, f32)> = sums.into_par_iter().map(with_length).collect();
         let mut region = |(mixture, length): (Vec<(u32, f32)>, f32)| match length > MIN_MEAN_LENGTH {
             true => Ok(Some(MixtureRegion { region: table.append_mixture(&mixture)?, length })),
             false => Ok(None),
@@ -164,7 +140,7 @@ impl Mixtures {
         let entry_of = |k: usize| -> Option<AddedEntry> {
             let superpoint = self.of_gaussian[gaussians[k] as usize];
             let MixtureRegion { region, length: of_mixture } = (*self.regions.get(superpoint as usize)?)?;
-            let own = length(&sum_of(contributions, contributions.entries_of(k), region_points));
+            let own = length(&sum_of(contributions, k, region_points));
             if contributions.total_weights[k] > 0.0 && own > MIN_MEAN_LENGTH * contributions.total_weights[k]
             {
                 let weight = share * own / of_mixture;
@@ -233,15 +209,10 @@ pub(super) fn points_of_regions(
     regions.into_par_iter().map(point).collect()
 }
 
-pub(super) fn sum_of(
-    contributions: &PartContributions,
-    entries: Range<usize>,
-    region_points: &[Point],
-) -> Point {
+pub(super) fn sum_of(contributions: &PartContributions, k: usize, region_points: &[Point]) -> Point {
     let mut sum = [0.0; AXES];
-    for (region, weight) in contributions.regions[entries.clone()].iter().zip(&contributions.weights[entries])
-    {
-        add(&mut sum, *weight, &region_points[*region as usize]);
+    for (region, weight) in contributions.entries(k) {
+        add(&mut sum, weight, &region_points[region as usize]);
     }
     sum
 }

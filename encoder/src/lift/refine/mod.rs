@@ -2,8 +2,8 @@
 //!
 //! | file | field of [`Aggregation`] | effect |
 //! |---|---|---|
-//! | `mod` | `truncation_power` | masks that the photo's edge cuts off count less |
-//! | `prune` | `min_view_share` | contributions of a view that hardly shows the Gaussian are dropped |
+//! | this | `truncation_power` | masks that the photo's edge cuts off count less |
+//! | this | `min_view_share` | contributions of a view that hardly shows the Gaussian are dropped |
 //! | `mixture` | `superpoint`, `coarse`, `object` | a Gaussian takes a share of its superpoint, then of a larger one, then of its object |
 //! | `mixture` | `fill` | a Gaussian without evidence takes its superpoint's mean |
 //!
@@ -15,10 +15,11 @@
 //! refinement; [`PendingRefinement::finish`] returns the table with the mixtures. Decisions are made in principal
 //! coordinates of the mask vectors (`points`) and in one order: the result depends neither on threads nor on memory.
 
-mod mixture;
-mod prune;
-mod settings;
+use std::ops::Range;
 
+use mixture::{AXES, Mixtures, Point, Sums};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use slag_math::axes::principal_coordinates;
 
 use super::contributions::ContributionError;
@@ -29,8 +30,8 @@ use super::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Supe
 use super::table::RegionTable;
 use crate::masks::Mask;
 use crate::memory::{self, MemoryPlan, Phase};
-use mixture::{AXES, Mixtures, PartSums, Point, SuperpointSums};
-pub use settings::Aggregation;
+
+mod mixture;
 
 /// Least base of a mask's weight: even a mask that is wholly cut off gives evidence.
 const LEAST_MASK_WEIGHT: f32 = 0.01;
@@ -102,17 +103,18 @@ impl PendingRefinement {
         }
         let refinement = Refinement {
             settings,
-            first_regions: scene.index.first_regions(),
+            first_regions: scene.index.views.iter().map(|view| view.first_region).collect(),
             mask_counts: table.mask_counts(0..table.len()),
             region_points: Vec::new(),
             mixtures: Vec::new(),
         };
         let mut pending = Self { refinement, table, mask_points: Vec::new(), scales: Vec::new() };
-        if settings.needs_mixtures() && !pending.table.is_empty() {
+        // Where Gaussians share evidence, vectors are needed in principal coordinates.
+        if settings.n_partitions() > 0 && !pending.table.is_empty() {
             let Self { refinement, table, mask_points, scales } = &mut pending;
             *mask_points = principal_coordinates(table.mask_vectors(), AXES).as_chunks().0.to_vec();
             refinement.region_points = mixture::points_of_regions(table, mask_points, 0..table.len());
-            if settings.needs_superpoints() {
+            if settings.n_scales() > 0 {
                 *scales = refinement.superpoints(scene, table)?;
             }
         }
@@ -187,14 +189,16 @@ impl Refinement {
         mask_points: &[Point],
         scales: Vec<(f32, Superpoints)>,
     ) -> Result<(), ContributionError> {
-        let mut sums: Vec<SuperpointSums> = scales.iter().map(|(_, of)| SuperpointSums::new(of.n)).collect();
-        let of_part = |mut contributions: PartContributions| -> Vec<PartSums> {
+        let mut sums: Vec<Vec<Sums>> = scales.iter().map(|(_, of)| vec![Vec::new(); of.n]).collect();
+        let of_part = |mut contributions: PartContributions| -> Vec<Vec<(usize, Sums)>> {
             self.prune(&mut contributions);
             let gaussians = contributions.part.gaussians(scene.split);
-            scales.iter().map(|(_, of)| PartSums::new(&contributions, gaussians, of)).collect()
+            scales.iter().map(|(_, of)| mixture::part_sums(&contributions, gaussians, of)).collect()
         };
         scene.visit(table, of_part, |of_part| {
-            sums.iter_mut().zip(of_part).for_each(|(sums, of_part)| sums.add(of_part));
+            for (sums, of_part) in sums.iter_mut().zip(of_part) {
+                of_part.into_iter().for_each(|(superpoint, entries)| sums[superpoint].extend(entries));
+            }
         })?;
         for ((weight, superpoints), sums) in scales.into_iter().zip(sums) {
             self.mixtures.push(Mixtures::new(weight, superpoints, sums, table, mask_points)?);
@@ -209,10 +213,9 @@ impl Refinement {
     /// Reserves lists over all Gaussians: the superpoints' graph, and each Gaussian's superpoints until the last cell.
     pub(crate) fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
         let n_scales = settings.n_scales();
-        if settings.needs_superpoints() {
+        if n_scales > 0 {
             let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
-            let graph_bytes =
-                Superpoints::working_bytes(n_gaussians, n_scales, &SuperpointSettings::default());
+            let graph_bytes = Superpoints::working_bytes(n_gaussians, n_scales);
             memory.reserve(Phase::Superpoints, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
         }
         let labels_bytes = |n_partitions: usize| (n_gaussians * n_partitions * size_of::<u32>()) as u64;
@@ -229,11 +232,11 @@ impl Refinement {
         n_regions: usize,
         n_entries: u64,
     ) {
-        if *settings != Aggregation::PLAIN {
+        if *settings != Aggregation::default() {
             let len_bytes = n_regions * (size_of::<Point>() + size_of::<f32>());
             memory.reserve(Phase::Always, "vectors of regions", len_bytes as u64);
         }
-        let sums_bytes = SuperpointSums::len_bytes(n_entries) * settings.n_partitions() as u64;
+        let sums_bytes = mixture::sums_bytes(n_entries) * settings.n_partitions() as u64;
         memory.reserve(Phase::Refine, "sums of superpoints", sums_bytes);
     }
 
@@ -245,9 +248,111 @@ impl Refinement {
         }
     }
 
+    /// Drops entries of views where a Gaussian has less than the least share of its weight in its best view.
     fn prune(&self, contributions: &mut PartContributions) {
-        prune::prune(contributions, self.settings.min_view_share, &self.first_regions, &self.mask_counts);
+        let least = self.settings.min_view_share;
+        if least <= 0.0 {
+            return;
+        }
+        let kept_of = |k: usize| -> Vec<Range<usize>> {
+            let views = by_view(contributions, contributions.entries_of(k), &self.first_regions);
+            let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
+            let seen = views.into_iter().filter(|view| view.weight >= least * best);
+            seen.map(|view| view.entries).collect()
+        };
+        let n = contributions.total_weights.len();
+        let kept: Vec<Vec<Range<usize>>> = (0..n).into_par_iter().with_min_len(CHUNK).map(kept_of).collect();
+        let mut at = 0;
+        for (k, kept) in kept.into_iter().enumerate() {
+            let mut total = 0.0;
+            for entry in kept.into_iter().flatten() {
+                let (region, weight) = (contributions.regions[entry], contributions.weights[entry]);
+                (contributions.regions[at], contributions.weights[at]) = (region, weight);
+                total += f64::from(weight) * f64::from(self.mask_counts[region as usize]);
+                at += 1;
+            }
+            contributions.starts[k + 1] = at as u64;
+            contributions.total_weights[k] = total as f32;
+        }
+        contributions.regions.truncate(at);
+        contributions.weights.truncate(at);
     }
+}
+
+/// How the contributions of all views become embeddings. The default is the paper's weighted average.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Aggregation {
+    /// Drops views in which a Gaussian has less than this share of its weight in its best view, 0..=1.
+    pub(crate) min_view_share: f32,
+    /// Each mask counts (1 - truncation)^`truncation_power`. A mask's truncation is the share of its outline that
+    /// the photo's edge cuts off.
+    pub(crate) truncation_power: f32,
+    /// Weight of the superpoint's mean, relative to the Gaussian's own.
+    pub(crate) superpoint: f32,
+    /// Weight of the larger superpoint's mean, relative to the result so far.
+    pub coarse: f32,
+    /// Weight of the mean of the Gaussian's object, relative to the result so far.
+    pub object: f32,
+    /// Whether Gaussians without evidence take their superpoint's mean.
+    pub fill: bool,
+}
+
+impl Aggregation {
+    /// The refinements that help on both trained and generated splats (docs/decisions.md). Larger shares of superpoints
+    /// smooth small things away.
+    pub(crate) const REFINED: Self = Self {
+        min_view_share: 0.05,
+        truncation_power: 2.0,
+        superpoint: 1.5,
+        coarse: 0.5,
+        object: 0.25,
+        fill: true,
+    };
+
+    pub(crate) fn has_fine_superpoints(&self) -> bool {
+        self.superpoint > 0.0 || self.fill
+    }
+
+    /// Partitions within which Gaussians share evidence.
+    pub(super) fn n_partitions(&self) -> usize {
+        self.n_scales() + usize::from(self.object > 0.0)
+    }
+
+    pub(super) fn n_scales(&self) -> usize {
+        usize::from(self.has_fine_superpoints()) + usize::from(self.coarse > 0.0)
+    }
+}
+
+/// Least number of Gaussians per task.
+const CHUNK: usize = 4096;
+
+struct ViewEntries {
+    entries: Range<usize>,
+    weight: f32,
+}
+
+/// Splits a Gaussian's entries, ascending by region, by view. `first_regions`: of each view, ascending.
+fn by_view(
+    contributions: &PartContributions,
+    entries: Range<usize>,
+    first_regions: &[u32],
+) -> Vec<ViewEntries> {
+    let mut views: Vec<ViewEntries> = Vec::new();
+    let mut end_region = 0;
+    for entry in entries {
+        let region = contributions.regions[entry];
+        if views.is_empty() || region >= end_region {
+            let next = first_regions.partition_point(|first| *first <= region);
+            end_region = first_regions.get(next).copied().unwrap_or(u32::MAX);
+            views.push(ViewEntries { entries: entry..entry, weight: 0.0 });
+        }
+        if let Some(view) = views.last_mut() {
+            view.entries.end = entry + 1;
+            view.weight += contributions.weights[entry];
+        }
+    }
+    views
 }
 
 #[cfg(test)]

@@ -221,7 +221,7 @@ fn the_plain_average_changes_neither_table_nor_contributions() {
 fn what_masks_and_views_count_is_that_of_the_definition() {
     let views = views();
     for (truncation_power, min_view_share) in [(0.0, 0.3), (2.0, 0.0), (2.0, 0.3), (0.5, 0.05)] {
-        let settings = Aggregation { truncation_power, min_view_share, ..Aggregation::PLAIN };
+        let settings = Aggregation { truncation_power, min_view_share, ..Aggregation::default() };
         let Lifted { field, table, embeddings } = lifted(settings, u64::MAX);
         let counts = oracle_counts(&views, &settings);
         for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
@@ -245,7 +245,7 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
 fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
     let views = views();
     // Larger superpoints are the same patches here.
-    let parts = |superpoint, coarse| Aggregation { superpoint, coarse, fill: true, ..Aggregation::PLAIN };
+    let parts = |superpoint, coarse| Aggregation { superpoint, coarse, fill: true, ..Aggregation::default() };
     for (settings, n_levels) in [(parts(1.0, 0.0), 1), (parts(0.0, 0.5), 2), (parts(2.0, 0.5), 2)] {
         let Lifted { field, embeddings, table } = lifted(settings, u64::MAX);
         for k in 0..N {
@@ -266,10 +266,10 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
         assert_eq!(RegionTable::from_bytes(&AlignedBytes::copy_of(&bytes)).expect("valid"), table);
     }
 
-    let unfilled = lifted(Aggregation { superpoint: 1.0, ..Aggregation::PLAIN }, u64::MAX);
+    let unfilled = lifted(Aggregation { superpoint: 1.0, ..Aggregation::default() }, u64::MAX);
     assert!(UNSEEN.iter().all(|k| !unfilled.field.has_evidence(*k)));
-    let only_filled = lifted(Aggregation { fill: true, ..Aggregation::PLAIN }, u64::MAX);
-    let plain = lifted(Aggregation::PLAIN, u64::MAX);
+    let only_filled = lifted(Aggregation { fill: true, ..Aggregation::default() }, u64::MAX);
+    let plain = lifted(Aggregation::default(), u64::MAX);
     for k in 0..N {
         let same = only_filled.embeddings[k * DIM..][..DIM] == plain.embeddings[k * DIM..][..DIM];
         assert_eq!(same, !UNSEEN.contains(&k), "{k}");
@@ -284,7 +284,7 @@ fn an_object_gives_its_part_to_its_gaussians() {
     let [object_of] = object_of();
     let sum_of = |members: &dyn Fn(usize) -> bool| unit(&sum_of(&views, (0..N).filter(|k| members(*k))));
     for superpoint in [0.0, 1.0] {
-        let found = lifted(Aggregation { superpoint, object: 0.5, ..Aggregation::PLAIN }, u64::MAX);
+        let found = lifted(Aggregation { superpoint, object: 0.5, ..Aggregation::default() }, u64::MAX);
         for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
             let patch = sum_of(&|other| other / 30 == k / 30);
             let mut expected = unit(&self::sum_of(&views, [k]));

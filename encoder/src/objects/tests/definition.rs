@@ -199,7 +199,7 @@ fn objects_are_those_of_the_definition() {
                 1.0 - f64::from(world.photos[view].outlines[mask as usize].cut_px) / 40.0
             };
             let found = world.objects_of(Some(&superpoints), u64::MAX, false).expect("not cancelled");
-            let pairs = near::pairs(&world.gaussians, &superpoints);
+            let pairs = tree::pairs(&world.gaussians, &superpoints);
             let (expected, n_masks) = oracle(&views, &pairs, &superpoints.of_gaussian, uncut);
             let mut object_of = vec![None; superpoints.n];
             for (cell, of_cell) in world.split.cells.iter().zip(&found.object_of) {

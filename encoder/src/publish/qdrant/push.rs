@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest};
 
-use super::database::{CellShard, Collection, Database};
+use super::database::{Collection, Database, exact_shard, points};
 use super::{Layout, PushError, PushOptions, PushProgress, PushReport};
 use crate::store::StoreReader;
 
@@ -151,11 +151,13 @@ impl<'a> Push<'a> {
         let n_points_before = self.report.n_points;
         for cell in target.cells.iter().skip(record.n_cells) {
             // No request is under way that reading a shard could delay.
-            let shard = CellShard::load(self.reader, cell)?;
-            while record.n_points_in_cell < shard.n_points() {
+            let stored = exact_shard(self.reader, cell)?;
+            let shard = stored.view();
+            let n_points = shard.n_with_evidence();
+            while record.n_points_in_cell < n_points {
                 let start = record.n_points_in_cell;
-                let end = shard.n_points().min(start.saturating_add(self.options.n_points_per_batch.get()));
-                collection.upsert(shard.points(start..end, manifest)).await?;
+                let end = n_points.min(start.saturating_add(self.options.n_points_per_batch.get()));
+                collection.upsert(points(&shard, start..end, manifest)).await?;
                 record.n_points_in_cell = end;
                 record.n_points += (end - start) as u64;
                 self.report.n_sent += (end - start) as u64;
@@ -164,7 +166,7 @@ impl<'a> Push<'a> {
             }
             record.n_cells += 1;
             record.n_points_in_cell = 0;
-            record.n_without_evidence += shard.n_without_evidence();
+            record.n_without_evidence += u64::from(shard.header.n_gaussians) - n_points as u64;
             self.records.write(name, &record).await?;
         }
         self.report.n_points += record.n_points;

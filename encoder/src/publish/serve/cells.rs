@@ -59,8 +59,7 @@ impl CellsQuery {
                 DVec3::new(x, y, z)
             }
             Self { x: None, y: None, z: None, lat: Some(lat), lon: Some(lon), height, .. } => {
-                geographic::world_from_geographic(manifest, lat, lon, height)
-                    .map_err(|e| bad_parameter(e.to_string()))?
+                geographic::world_from_geographic(manifest, lat, lon, height).map_err(bad_parameter)?
             }
             _ => return Err(bad_parameter("give the centre as x, y and z, or as lat and lon (and height)")),
         };

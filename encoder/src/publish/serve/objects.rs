@@ -84,7 +84,7 @@ pub(super) async fn object(
     ];
     let is_known = tag.is_known_to(&headers);
     let opened = service.with_current(move |snapshot| open_object(snapshot, hash, !is_known)).await?;
-    let Opened { file: Some(file), len_bytes } = opened else {
+    let (Some(file), len_bytes) = opened else {
         return Ok(As::new((StatusCode::NOT_MODIFIED, about)));
     };
     let (status, start, n_bytes) = match Selection::of_request(&method, &headers, &tag, len_bytes) {
@@ -118,17 +118,16 @@ pub(super) async fn object(
     Ok(As::new(response))
 }
 
-/// A listed object: its length, and its file if the content is needed.
-struct Opened {
-    file: Option<std::fs::File>,
-    len_bytes: u64,
-}
-
-fn open_object(snapshot: &Snapshot, hash: Hash32, with_file: bool) -> Result<Opened, Problem> {
+/// A listed object's length, and its file if the content is needed.
+fn open_object(
+    snapshot: &Snapshot,
+    hash: Hash32,
+    with_file: bool,
+) -> Result<(Option<std::fs::File>, u64), Problem> {
     let listed = snapshot.objects.get(&hash);
     let len_bytes = *listed.ok_or_else(|| problem::not_published(&format!("object {hash}")))?;
     if !with_file {
-        return Ok(Opened { file: None, len_bytes });
+        return Ok((None, len_bytes));
     }
     let file = fs_err::File::open(snapshot.reader.object_path(hash)).map_err(Problem::internal)?;
     let found_bytes = file.metadata().map_err(Problem::internal)?.len();
@@ -137,7 +136,7 @@ fn open_object(snapshot: &Snapshot, hash: Hash32, with_file: bool) -> Result<Ope
         let cause = format!("{path}: found {found_bytes} bytes, the manifest lists {len_bytes}");
         return Err(Problem::internal(cause));
     }
-    Ok(Opened { file: Some(file.into_file()), len_bytes })
+    Ok((Some(file.into_file()), len_bytes))
 }
 
 type Name = Result<UrlPath<String>, PathRejection>;

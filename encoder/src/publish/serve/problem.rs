@@ -3,8 +3,6 @@
 use axum::http::{HeaderValue, StatusCode, header};
 use slag_service::problem::Problem;
 
-use crate::publish::geographic::GeographicError;
-
 /// Delay after which a request beyond a limit may succeed.
 const RETRY_SECS: u32 = 2;
 
@@ -18,8 +16,7 @@ pub(super) fn not_published(what: &str) -> Problem {
 }
 
 /// Without a place on the earth, the resource does not exist in the scene's current state.
-pub(super) fn not_geo_referenced(error: GeographicError) -> Problem {
-    let detail = error.to_string();
+pub(super) fn not_geo_referenced(detail: String) -> Problem {
     Problem::new(StatusCode::CONFLICT, "not-geo-referenced", "Scene is not geo-referenced", detail)
 }
 

@@ -15,7 +15,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tower::ServiceExt;
 
 use super::*;
-use crate::store::tests::{manifest, manifest_of_boxes};
+use crate::store::tests::{manifest, manifest_of_boxes, new_store};
 use crate::store::{Extras, Store, StoreError, StoreReader};
 
 /// A store with generations 1 (shards 0 and 1) and 2 (shards 1 and 2), and all shards' bytes.
@@ -27,8 +27,7 @@ struct Fixture {
 }
 
 fn fixture() -> Fixture {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let content =
         |seed: u32| (0..200_000u32).map(|i| (i.wrapping_mul(2_654_435_761 + seed) >> 24) as u8).collect();
     let shards: Vec<(Hash32, Vec<u8>)> = (0..3)

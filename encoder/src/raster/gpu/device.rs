@@ -5,8 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use pollster::block_on;
 
 use super::shader::Kernels;
-use crate::raster::adapter::{AdapterReport, Precision};
-use crate::raster::rasterizer::RasterError;
+use crate::raster::{AdapterReport, Precision, RasterError};
 
 fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
     let info = adapter.get_info();
@@ -146,11 +145,5 @@ impl Device {
         // The failure's cause is more informative than that of the wait.
         self.check()?;
         polled.map_err(|e| self.error(e.to_string())).map(drop)
-    }
-
-    /// Fails like a lost device, for tests.
-    #[doc(hidden)]
-    pub fn lose(&self) {
-        self.device.destroy();
     }
 }

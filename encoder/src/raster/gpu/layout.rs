@@ -7,8 +7,7 @@ use slag_raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
 use slag_raster::{RasterView, reach2};
 
 use super::shader::{Counter, Counts, SUM_FRACTION_BITS};
-use crate::raster::adapter::Precision;
-use crate::raster::rasterizer::RegionWeight;
+use crate::raster::{Precision, RegionWeight};
 
 /// A Gaussian in device memory.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -276,26 +275,10 @@ mod tests {
 
             let (columns, size_bytes) = layout_of("project", "View", precision);
             let names: Vec<&str> = columns.iter().map(|c| c.0.as_str()).collect();
-            assert_eq!(
-                names,
-                [
-                    "rotation",
-                    "position_high",
-                    "position_low",
-                    "focal_x_px",
-                    "focal_y_px",
-                    "centre_x_px",
-                    "centre_y_px",
-                    "width_px",
-                    "height_px",
-                    "first_tile_row",
-                    "end_tile_row",
-                    "tile_columns",
-                    "capacity_visible",
-                    "capacity_pairs",
-                    "capacity_entries",
-                ]
-            );
+            let expected = "rotation position_high position_low focal_x_px focal_y_px centre_x_px centre_y_px \
+                            width_px height_px first_tile_row end_tile_row tile_columns capacity_visible \
+                            capacity_pairs capacity_entries";
+            assert_eq!(names.join(" "), expected);
             let real_bytes = if precision == Precision::F64 { 8 } else { 4 };
             assert!(columns.windows(2).all(|w| w[0].1 + w[0].2 == w[1].1), "no gaps: {columns:?}");
             let width = columns.iter().find(|c| c.0 == "width_px").expect("width_px").1;

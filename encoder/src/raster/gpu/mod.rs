@@ -6,7 +6,6 @@
 //! Data beyond a binding's limit is divided: the scene into chunks, the image into bands of tile rows. This changes no
 //! contribution, because tiles are independent and integers add up exactly.
 
-mod buffers;
 mod device;
 mod jobs;
 mod layout;
@@ -24,14 +23,14 @@ use slag_math::stats::{Rank, quantile};
 use slag_raster::constants::TILE_SIZE_PX;
 use slag_raster::{Drawing, RasterView, ViewCounters, check_scene, check_view, colour};
 
-pub(crate) use super::adapter::AdapterReport;
-pub use super::adapter::{GpuOptions, Precision};
+pub(crate) use super::AdapterReport;
 use super::cpu::{CpuRasterizer, check_regions};
-use super::rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
+pub use super::{GpuOptions, Precision};
+use super::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
 use crate::masks::RegionMap;
-use buffers::{REGION_BYTES, Size};
 pub(crate) use device::Adapter;
 pub use device::{Device, adapters};
+use jobs::{REGION_BYTES, Size};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, Counts, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
 use stages::{SCENE_GAUSSIAN_BYTES, SceneChunk};
@@ -54,7 +53,7 @@ impl GpuRasterizer {
     /// Fails like a lost device, for tests.
     #[doc(hidden)]
     pub fn lose(&self) {
-        self.device.lose();
+        self.device.device.destroy();
     }
 }
 
@@ -220,18 +219,6 @@ impl<'s> GpuScene<'s> {
             .ok_or_else(|| self.device.capacity_error(format!("out of memory for {capacities:?}")))
     }
 
-    /// Processes a view band by band. `work` does a band in a workspace and returns its counts. If a count exceeds its
-    /// capacity, the band is repeated with larger capacities, or in two halves.
-    fn each_band(
-        &self,
-        view: &RasterView,
-        px_bytes: u64,
-        mut work: impl FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
-    ) -> Result<ViewCounters, RasterError> {
-        let mut lent = LentWorkspace { scene: self, workspace: self.take_workspace() };
-        self.bands_of(&mut lent.workspace, view, px_bytes, &mut work)
-    }
-
     /// Takes a workspace for a band, or makes one; `None` if memory does not suffice but another view's may be tried.
     fn workspace_for(
         &self,
@@ -254,13 +241,16 @@ impl<'s> GpuScene<'s> {
         }
     }
 
-    fn bands_of(
+    /// Processes a view band by band. `work` does a band in a workspace and returns its counts. If a count exceeds its
+    /// capacity, the band is repeated with larger capacities, or in two halves.
+    fn each_band(
         &self,
-        workspace: &mut Option<Workspace>,
         view: &RasterView,
         px_bytes: u64,
-        work: &mut dyn FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
+        mut work: impl FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
     ) -> Result<ViewCounters, RasterError> {
+        let mut lent = LentWorkspace { scene: self, workspace: self.take_workspace() };
+        let workspace = &mut lent.workspace;
         let tile = TILE_SIZE_PX as u32;
         let (width_px, height_px) = (view.intrinsics.width_px, view.intrinsics.height_px);
         let max = self.max_capacities();
@@ -434,16 +424,22 @@ impl LoadedScene for GpuScene<'_> {
 mod tests {
     use super::*;
 
+    /// The first GPU; `None` without one.
+    pub(super) fn first_gpu() -> Option<Device> {
+        let adapter = adapters().into_iter().next();
+        if adapter.is_none() {
+            println!("skipped: no GPU");
+        }
+        adapter.map(|adapter| adapter.open(adapter.report.precision).expect("opens"))
+    }
+
     /// A panic in one view gives its place to the next, which would wait for ever otherwise.
     #[test]
     fn a_panic_gives_its_place_back() {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
-            return;
-        };
-        let device = Arc::new(adapter.open(Precision::F32).expect("opens"));
-        let (gaussians, options) =
-            (Gaussians::default(), GpuOptions { views_in_flight: 1, ..GpuOptions::default() });
+        let Some(device) = first_gpu() else { return };
+        let device = Arc::new(device);
+        let options = GpuOptions { views_in_flight: 1, ..GpuOptions::default() };
+        let gaussians = Gaussians::default();
         let scene = GpuScene::new(device, options, &gaussians).expect("loads");
         let view = RasterView {
             camera_from_world: glam::DAffine3::IDENTITY,
@@ -459,13 +455,10 @@ mod tests {
     /// Three views and memory for one: the places of two are given up, and none is made anew.
     #[test]
     fn fewer_views_are_in_flight_where_memory_does_not_suffice() {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
-            return;
-        };
-        let device = Arc::new(adapter.open(adapter.report.precision).expect("opens"));
-        let (gaussians, options) =
-            (Gaussians::default(), GpuOptions { views_in_flight: 3, ..GpuOptions::default() });
+        let Some(device) = first_gpu() else { return };
+        let device = Arc::new(device);
+        let options = GpuOptions { views_in_flight: 3, ..GpuOptions::default() };
+        let gaussians = Gaussians::default();
         let scene = GpuScene::new(device, options, &gaussians).expect("loads");
         (0..3).for_each(|_| assert!(scene.take_workspace().is_none(), "to be made"));
         assert_eq!([(); 3].map(|()| scene.give_up_workspace()), [true, true, false]);

@@ -9,7 +9,7 @@ use slag_raster::constants::{
 };
 use slag_raster::{EXP_OF_MINUS_C, MAX_POWER};
 
-use crate::raster::adapter::Precision;
+use crate::raster::Precision;
 
 /// Equal to the pixels of a tile.
 pub(crate) const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;

@@ -1,221 +1,188 @@
 //! The commands of each stage.
 
+use std::cell::RefCell;
 use std::collections::HashMap;
 
 use wgpu::BufferUsages as Usage;
 
-use super::buffers::Buffers;
 use super::device::Device;
-use super::jobs::{DIGIT_BITS, JOB_STRIDE_BYTES, Scan, SortKey, dispatch_offset, part, sort_job};
+use super::jobs::{Buffers, DIGIT_BITS, DISPATCH_BYTES, JOB_STRIDE_BYTES, Scan, SortKey, part, sort_job};
 use super::layout::{Chunk, ScanJob, SceneGaussian};
 use super::shader::{Counter, NONE, WORKGROUP_SIZE};
 
+type Pass<'p> = wgpu::ComputePass<'p>;
+
+/// Numbers of bindings, and what is bound.
+type Bound<'b> = [(u32, wgpu::BufferBinding<'b>)];
+
+/// How many workgroups run.
+enum Groups {
+    /// Along x and y.
+    Given([u32; 2]),
+    /// A thread for each item that shaders counted.
+    OfItems(Counter),
+    /// A workgroup for each sort block of them.
+    OfBlocks(Counter),
+}
+
 pub(crate) struct Stages {
     pub buffers: Buffers,
-    groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
+    /// By kernel and number, made at first use.
+    groups: RefCell<HashMap<(wgpu::ComputePipeline, u32), wgpu::BindGroup>>,
 }
 
 impl Stages {
     pub fn new(buffers: Buffers) -> Self {
-        Self { buffers, groups: HashMap::new() }
+        Self { buffers, groups: RefCell::default() }
+    }
+
+    /// `number`: tells bind groups of a kernel apart.
+    fn run(
+        &self,
+        device: &Device,
+        pass: &mut Pass<'_>,
+        (kernel, number): (&wgpu::ComputePipeline, u32),
+        bound: &Bound<'_>,
+        groups: Groups,
+    ) {
+        let mut known = self.groups.borrow_mut();
+        let group = known.entry((kernel.clone(), number)).or_insert_with(|| bind(device, kernel, bound));
+        let (counter, by_block) = match groups {
+            Groups::Given(n) => return dispatch(pass, kernel, group, n),
+            Groups::OfItems(counter) => (counter, 0),
+            Groups::OfBlocks(counter) => (counter, 1),
+        };
+        pass.set_pipeline(kernel);
+        pass.set_bind_group(0, &*group, &[]);
+        let offset = (counter as u64 * 2 + by_block) * DISPATCH_BYTES;
+        pass.dispatch_workgroups_indirect(&self.buffers.dispatches, offset);
     }
 
     pub fn project(
         &self,
         device: &Device,
-        pass: &mut wgpu::ComputePass<'_>,
+        pass: &mut Pass<'_>,
         chunk: &SceneChunk,
         gaussians: &wgpu::Buffer,
     ) {
         let kernels = &device.kernels;
-        let n_blocks = chunk.n_gaussians.div_ceil(WORKGROUP_SIZE);
-        let chunk_job = part(&chunk.jobs, 0);
-        let bound = [&self.buffers.view, &self.buffers.counters]
-            .map(whole)
-            .into_iter()
-            .chain([chunk_job, whole(gaussians)]);
-        let bound: Vec<_> = bound.chain([whole(&self.buffers.block_counts)]).collect();
-        let group = bind(device, &kernels.count_visible, &number(&bound));
-        dispatch(pass, &kernels.count_visible, &group, [n_blocks, 1]);
-        let scan = [
-            part(&chunk.jobs, 1),
-            whole(&self.buffers.counters),
-            whole(&self.buffers.block_counts),
-            whole(&self.buffers.dispatches),
-        ];
-        let group = bind(device, &kernels.scan, &number(&scan));
-        dispatch(pass, &kernels.scan, &group, [1, 1]);
+        let Buffers { view, counters, dispatches, block_counts, screen, tile_counts, .. } = &self.buffers;
+        let n_blocks = [chunk.n_gaussians.div_ceil(WORKGROUP_SIZE), 1];
+        let job = || part(&chunk.jobs, 0);
+        let mut run = |kernel: &wgpu::ComputePipeline, bound: &Bound<'_>, n| {
+            dispatch(pass, kernel, &bind(device, kernel, bound), n);
+        };
+        let bound = [whole(view), whole(counters), job(), whole(gaussians), whole(block_counts)];
+        run(&kernels.count_visible, &number(&bound), n_blocks);
+        let bound = [part(&chunk.jobs, 1), whole(counters), whole(block_counts), whole(dispatches)];
+        run(&kernels.scan, &number(&bound), [1, 1]);
         let bound = [
-            (0, whole(&self.buffers.view)),
-            (2, part(&chunk.jobs, 0)),
+            (0, whole(view)),
+            (2, job()),
             (3, whole(gaussians)),
-            (4, whole(&self.buffers.block_counts)),
-            (5, whole(&self.buffers.screen)),
-            (6, whole(&self.buffers.tile_counts)),
+            (4, whole(block_counts)),
+            (5, whole(screen)),
+            (6, whole(tile_counts)),
         ];
-        let group = bind(device, &kernels.write_visible, &bound);
-        dispatch(pass, &kernels.write_visible, &group, [n_blocks, 1]);
+        run(&kernels.write_visible, &bound, n_blocks);
     }
 
-    pub fn scan(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, scan: Scan) {
+    pub fn scan(&self, device: &Device, pass: &mut Pass<'_>, scan: Scan) {
+        let Buffers { jobs, counters, dispatches, histogram, block_counts, .. } = &self.buffers;
         let values = match scan {
-            Scan::Digits(_) => &self.buffers.histogram,
-            Scan::Pairs | Scan::Entries | Scan::Heads => &self.buffers.block_counts,
+            Scan::Digits(_) => histogram,
+            Scan::Pairs | Scan::Entries | Scan::Heads => block_counts,
         };
-        let bound = [
-            part(&self.buffers.jobs, scan.index()),
-            whole(&self.buffers.counters),
-            whole(values),
-            whole(&self.buffers.dispatches),
-        ];
-        let group = cached(&mut self.groups, ("scan", scan.index() as u32), || {
-            bind(device, &device.kernels.scan, &number(&bound))
-        });
-        dispatch(pass, &device.kernels.scan, group, [1, 1]);
+        let bound = [part(jobs, scan.index()), whole(counters), whole(values), whole(dispatches)];
+        let kernel = (&device.kernels.scan, scan.index() as u32);
+        self.run(device, pass, kernel, &number(&bound), Groups::Given([1, 1]));
     }
 
     /// Sorts by a key of `bits` bits; returns the index of the buffer with the order.
-    pub fn sort(
-        &mut self,
-        device: &Device,
-        pass: &mut wgpu::ComputePass<'_>,
-        (key, bits): (SortKey, u32),
-    ) -> usize {
+    pub fn sort(&self, device: &Device, pass: &mut Pass<'_>, (key, bits): (SortKey, u32)) -> usize {
         let n_passes = bits.div_ceil(DIGIT_BITS).max(1);
-        let kernels = &device.kernels;
-        let offset = dispatch_offset(key.counter(), true);
+        let (kernels, buffers) = (&device.kernels, &self.buffers);
+        let (values, order) = match key {
+            SortKey::Depth => (&buffers.screen, &buffers.visible_order),
+            SortKey::Tile => (&buffers.pairs, &buffers.pair_order),
+            SortKey::MemberRegion => (&buffers.entries, &buffers.entry_order),
+        };
         for digit in 0..n_passes {
-            let (values, order) = match key {
-                SortKey::Depth => (&self.buffers.screen, &self.buffers.visible_order),
-                SortKey::Tile => (&self.buffers.pairs, &self.buffers.pair_order),
-                SortKey::MemberRegion => (&self.buffers.entries, &self.buffers.entry_order),
-            };
             let (from, to) = (digit as usize % 2, 1 - digit as usize % 2);
             let job = sort_job(key, digit);
             let bound = number(&[
-                part(&self.buffers.jobs, job),
-                whole(&self.buffers.counters),
+                part(&buffers.jobs, job),
+                whole(&buffers.counters),
                 whole(values),
                 whole(&order[from]),
-                whole(&self.buffers.histogram),
+                whole(&buffers.histogram),
                 whole(&order[to]),
             ]);
-            let [count, scatter] =
-                [("count_digits", &kernels.count_digits, 5), ("scatter", &kernels.scatter, 6)].map(
-                    |(name, kernel, n)| {
-                        cached(&mut self.groups, (name, job as u32), || bind(device, kernel, &bound[..n]))
-                            .clone()
-                    },
-                );
-            dispatch_indirect(pass, &kernels.count_digits, &count, (&self.buffers.dispatches, offset));
+            let blocks = || Groups::OfBlocks(key.counter());
+            self.run(device, pass, (&kernels.count_digits, job as u32), &bound[..5], blocks());
             self.scan(device, pass, Scan::Digits(key.counter()));
-            dispatch_indirect(pass, &kernels.scatter, &scatter, (&self.buffers.dispatches, offset));
+            self.run(device, pass, (&kernels.scatter, job as u32), &bound, blocks());
         }
         n_passes as usize % 2
     }
 
-    pub fn pair(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, depth_order: usize) {
-        let offset = dispatch_offset(Counter::Visible, false);
-        let order = &self.buffers.visible_order[depth_order];
-        let counted = [
-            (0, whole(&self.buffers.view)),
-            (1, whole(&self.buffers.counters)),
-            (3, whole(&self.buffers.tile_counts)),
-            (4, whole(order)),
-            (5, whole(&self.buffers.block_counts)),
+    pub fn pair(&self, device: &Device, pass: &mut Pass<'_>, depth_order: usize) {
+        let (kernels, buffers) = (&device.kernels, &self.buffers);
+        let bound = [
+            (0, whole(&buffers.view)),
+            (1, whole(&buffers.counters)),
+            (3, whole(&buffers.tile_counts)),
+            (4, whole(&buffers.visible_order[depth_order])),
+            (5, whole(&buffers.block_counts)),
+            (2, whole(&buffers.screen)),
+            (6, whole(&buffers.pairs)),
         ];
-        let written = [(2, whole(&self.buffers.screen)), (6, whole(&self.buffers.pairs))];
-        let written: Vec<_> = counted.iter().chain(&written).cloned().collect();
-        let kernels = &device.kernels;
-        let key = depth_order as u32;
-        let group =
-            cached(&mut self.groups, ("count_pairs", key), || bind(device, &kernels.count_pairs, &counted));
-        dispatch_indirect(pass, &kernels.count_pairs, group, (&self.buffers.dispatches, offset));
-        let group =
-            cached(&mut self.groups, ("write_pairs", key), || bind(device, &kernels.write_pairs, &written))
-                .clone();
+        let (number, items) = (depth_order as u32, || Groups::OfItems(Counter::Visible));
+        self.run(device, pass, (&kernels.count_pairs, number), &bound[..5], items());
         self.scan(device, pass, Scan::Pairs);
-        dispatch_indirect(pass, &kernels.write_pairs, &group, (&self.buffers.dispatches, offset));
+        self.run(device, pass, (&kernels.write_pairs, number), &bound, items());
     }
 
-    pub(crate) fn find_ranges(
-        &mut self,
-        device: &Device,
-        pass: &mut wgpu::ComputePass<'_>,
-        pair_order: usize,
-    ) {
+    pub(crate) fn find_ranges(&self, device: &Device, pass: &mut Pass<'_>, pair_order: usize) {
+        let (kernels, buffers) = (&device.kernels, &self.buffers);
         let bound = [
-            (0, whole(&self.buffers.view)),
-            (1, whole(&self.buffers.counters)),
-            (4, whole(&self.buffers.pair_order[pair_order])),
-            (7, whole(&self.buffers.pairs)),
-            (8, whole(&self.buffers.ranges)),
-            (9, whole(&self.buffers.members)),
+            (0, whole(&buffers.view)),
+            (1, whole(&buffers.counters)),
+            (4, whole(&buffers.pair_order[pair_order])),
+            (7, whole(&buffers.pairs)),
+            (8, whole(&buffers.ranges)),
+            (9, whole(&buffers.members)),
         ];
-        let kernel = &device.kernels.find_ranges;
-        let group =
-            cached(&mut self.groups, ("find_ranges", pair_order as u32), || bind(device, kernel, &bound));
-        dispatch_indirect(
-            pass,
-            kernel,
-            group,
-            (&self.buffers.dispatches, dispatch_offset(Counter::Pairs, false)),
-        );
-        let bound = [
-            (0, whole(&self.buffers.view)),
-            (10, whole(&self.buffers.ranges)),
-            (11, whole(&self.buffers.tile_order)),
-        ];
-        let kernel = &device.kernels.order_tiles;
-        let group = cached(&mut self.groups, ("order_tiles", 0), || bind(device, kernel, &bound));
-        dispatch(pass, kernel, group, [1, 1]);
+        let items = Groups::OfItems(Counter::Pairs);
+        self.run(device, pass, (&kernels.find_ranges, pair_order as u32), &bound, items);
+        let bound =
+            [(0, whole(&buffers.view)), (10, whole(&buffers.ranges)), (11, whole(&buffers.tile_order))];
+        self.run(device, pass, (&kernels.order_tiles, 0), &bound, Groups::Given([1, 1]));
     }
 
-    pub(crate) fn blend(
-        &mut self,
-        device: &Device,
-        pass: &mut wgpu::ComputePass<'_>,
-        (columns, rows): (u32, u32),
-    ) {
-        let bound = [
-            &self.buffers.view,
-            &self.buffers.counters,
-            &self.buffers.screen,
-            &self.buffers.members,
-            &self.buffers.ranges,
-            &self.buffers.regions,
-            &self.buffers.entries,
-            &self.buffers.tile_order,
-        ]
-        .map(whole);
-        let kernel = &device.kernels.sum_regions;
-        let group = cached(&mut self.groups, ("sum_regions", 0), || bind(device, kernel, &number(&bound)));
-        dispatch(pass, kernel, group, [columns, rows]);
+    pub(crate) fn blend(&self, device: &Device, pass: &mut Pass<'_>, tiles: [u32; 2]) {
+        let Buffers { view, counters, screen, members, ranges, regions, entries, tile_order, .. } =
+            &self.buffers;
+        let bound = [view, counters, screen, members, ranges, regions, entries, tile_order].map(whole);
+        self.run(device, pass, (&device.kernels.sum_regions, 0), &number(&bound), Groups::Given(tiles));
         self.scan(device, pass, Scan::Entries);
     }
 
-    pub fn compact(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, entry_order: usize) {
-        let order = &self.buffers.entry_order[entry_order];
+    pub fn compact(&self, device: &Device, pass: &mut Pass<'_>, entry_order: usize) {
+        let (kernels, buffers) = (&device.kernels, &self.buffers);
         let bound = [
-            (0, whole(&self.buffers.view)),
-            (1, whole(&self.buffers.counters)),
-            (2, whole(&self.buffers.screen)),
-            (3, whole(&self.buffers.entries)),
-            (4, whole(order)),
-            (5, whole(&self.buffers.block_counts)),
-            (6, whole(&self.buffers.region_sums)),
+            (2, whole(&buffers.screen)),
+            (0, whole(&buffers.view)),
+            (1, whole(&buffers.counters)),
+            (3, whole(&buffers.entries)),
+            (4, whole(&buffers.entry_order[entry_order])),
+            (5, whole(&buffers.block_counts)),
+            (6, whole(&buffers.region_sums)),
         ];
-        let kernels = &device.kernels;
-        let offset = dispatch_offset(Counter::Entries, false);
-        let key = entry_order as u32;
-        let counted: Vec<_> = bound.iter().filter(|b| b.0 != 2).cloned().collect();
-        let add_up =
-            cached(&mut self.groups, ("add_up", key), || bind(device, &kernels.add_up, &bound)).clone();
-        let group =
-            cached(&mut self.groups, ("count_heads", key), || bind(device, &kernels.count_heads, &counted));
-        dispatch_indirect(pass, &kernels.count_heads, group, (&self.buffers.dispatches, offset));
+        let (number, items) = (entry_order as u32, || Groups::OfItems(Counter::Entries));
+        self.run(device, pass, (&kernels.count_heads, number), &bound[1..], items());
         self.scan(device, pass, Scan::Heads);
-        dispatch_indirect(pass, &kernels.add_up, &add_up, (&self.buffers.dispatches, offset));
+        self.run(device, pass, (&kernels.add_up, number), &bound, items());
     }
 }
 
@@ -227,37 +194,21 @@ pub fn number<'a>(bindings: &[wgpu::BufferBinding<'a>]) -> Vec<(u32, wgpu::Buffe
     (0..).zip(bindings.iter().cloned()).collect()
 }
 
-pub fn bind(
-    device: &Device,
-    kernel: &wgpu::ComputePipeline,
-    bound: &[(u32, wgpu::BufferBinding<'_>)],
-) -> wgpu::BindGroup {
-    let entries: Vec<_> = bound
-        .iter()
-        .map(|(binding, buffer)| wgpu::BindGroupEntry {
-            binding: *binding,
-            resource: wgpu::BindingResource::Buffer(buffer.clone()),
-        })
-        .collect();
+pub fn bind<'b>(device: &Device, kernel: &wgpu::ComputePipeline, bound: &Bound<'b>) -> wgpu::BindGroup {
+    let entry = |(binding, buffer): &(u32, wgpu::BufferBinding<'b>)| {
+        let resource = wgpu::BindingResource::Buffer(buffer.clone());
+        wgpu::BindGroupEntry { binding: *binding, resource }
+    };
     device.device.create_bind_group(&wgpu::BindGroupDescriptor {
         label: None,
         layout: &kernel.get_bind_group_layout(0),
-        entries: &entries,
+        entries: &bound.iter().map(entry).collect::<Vec<_>>(),
     })
-}
-
-/// Returns the bind group of this name and number, creating it on first use.
-pub(crate) fn cached<'g>(
-    groups: &'g mut HashMap<(&'static str, u32), wgpu::BindGroup>,
-    key: (&'static str, u32),
-    make: impl FnOnce() -> wgpu::BindGroup,
-) -> &'g wgpu::BindGroup {
-    groups.entry(key).or_insert_with(make)
 }
 
 /// `n` workgroups, along x and y.
 pub(crate) fn dispatch(
-    pass: &mut wgpu::ComputePass<'_>,
+    pass: &mut Pass<'_>,
     kernel: &wgpu::ComputePipeline,
     group: &wgpu::BindGroup,
     n: [u32; 2],
@@ -265,18 +216,6 @@ pub(crate) fn dispatch(
     pass.set_pipeline(kernel);
     pass.set_bind_group(0, group, &[]);
     pass.dispatch_workgroups(n[0], n[1], 1);
-}
-
-/// With the number of workgroups from a buffer.
-pub(crate) fn dispatch_indirect(
-    pass: &mut wgpu::ComputePass<'_>,
-    kernel: &wgpu::ComputePipeline,
-    group: &wgpu::BindGroup,
-    (sizes, offset): (&wgpu::Buffer, u64),
-) {
-    pass.set_pipeline(kernel);
-    pass.set_bind_group(0, group, &[]);
-    pass.dispatch_workgroups_indirect(sizes, offset);
 }
 
 pub(crate) const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;

@@ -4,13 +4,14 @@ use bytemuck::Zeroable;
 use slag_raster::constants::TILE_SIZE_PX;
 use wgpu::BufferUsages as Usage;
 
-use super::buffers::{Buffers, COUNTERS_BYTES, Size, VIEW_BYTES, regions_bytes};
 use super::device::Device;
-use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
+use super::jobs::{
+    Buffers, COUNTERS_BYTES, Size, SortKey, VIEW_BYTES, bits_of, depth_keys, regions_bytes, write_sort_jobs,
+};
 use super::layout::{Background, Capacities, RegionSum, ViewBlock};
 use super::shader::{Counter, Counts};
 use super::stages::{SceneChunk, Stages, bind, dispatch, number, whole};
-use crate::raster::rasterizer::RasterError;
+use crate::raster::RasterError;
 
 pub(crate) const PIXEL_BYTES: u64 = 20;
 
@@ -67,9 +68,8 @@ impl Workspace {
         let device = band.device;
         self.set_region_bits(device, bits_of(n_regions));
         let mut encoder = self.bin(band, regions)?;
-        let [columns, rows] = band.tiles();
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        self.stages.blend(device, &mut pass, (columns, rows));
+        self.stages.blend(device, &mut pass, band.tiles());
         drop(pass);
         let mut pass = encoder.begin_compute_pass(&Default::default());
         let bits = bits_of(self.capacities.visible) + self.region_bits;
@@ -112,7 +112,6 @@ impl Workspace {
     ) -> Result<(Counts, Vec<f32>), RasterError> {
         let device = band.device;
         let mut encoder = self.bin(band, &[])?;
-        let [columns, rows] = band.tiles();
         let n_bytes = u64::from(self.n_px) * PIXEL_BYTES;
         let no_memory = || device.capacity_error("out of memory for a picture".into());
         let make = |label: &str, size, usage| device.buffer(label, size, usage).ok_or_else(no_memory);
@@ -134,7 +133,7 @@ impl Workspace {
         .map(whole);
         let kernel = &device.kernels.draw;
         let group = bind(device, kernel, &number(&bound));
-        dispatch(&mut encoder.begin_compute_pass(&Default::default()), kernel, &group, [columns, rows]);
+        dispatch(&mut encoder.begin_compute_pass(&Default::default()), kernel, &group, band.tiles());
         encoder.copy_buffer_to_buffer(&self.stages.buffers.counters, 0, &staging, 0, COUNTERS_BYTES);
         encoder.copy_buffer_to_buffer(&pixels, 0, &staging, COUNTERS_BYTES, n_bytes);
         let submission = device.queue.submit([encoder.finish()]);
@@ -142,10 +141,8 @@ impl Workspace {
         staging.map_async(wgpu::MapMode::Read, .., |_| {});
         device.wait(submission)?;
         let bytes = staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
-        let (head, rest) = bytes.split_at(COUNTERS_BYTES as usize);
-        let mut counts: Counts = Zeroable::zeroed();
-        counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
-        Ok((counts, bytemuck::cast_slice(rest).to_vec()))
+        let (counts, pixels) = counts_and_rest(&bytes);
+        Ok((counts, bytemuck::cast_slice(pixels).to_vec()))
     }
 
     fn upload(
@@ -181,19 +178,20 @@ impl Workspace {
         self.upload(&mut encoder, band, regions)?;
         encoder.clear_buffer(&self.stages.buffers.counters, 0, None);
         encoder.clear_buffer(&self.stages.buffers.ranges, 0, None);
+        let record = |encoder: &mut wgpu::CommandEncoder, chunk, gaussians: &wgpu::Buffer| {
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            self.stages.project(device, &mut pass, chunk, gaussians);
+        };
         for (index, chunk) in chunks.iter().enumerate() {
-            match &chunk.gaussians {
-                Some(gaussians) => self.project(device, &mut encoder, chunk, gaussians),
-                None => {
-                    let gaussians = upload(index)?;
-                    self.project(device, &mut encoder, chunk, &gaussians);
-                    // Waits before the next upload, so that at most one such chunk is on the device.
-                    let next = device.device.create_command_encoder(&Default::default());
-                    let full = std::mem::replace(&mut encoder, next);
-                    let submission = device.queue.submit([full.finish()]);
-                    device.wait(submission)?;
-                }
+            if let Some(gaussians) = &chunk.gaussians {
+                record(&mut encoder, chunk, gaussians);
+                continue;
             }
+            record(&mut encoder, chunk, &upload(index)?);
+            // Waits before the next upload, so that at most one such chunk is on the device.
+            let next = device.device.create_command_encoder(&Default::default());
+            let full = std::mem::replace(&mut encoder, next);
+            device.wait(device.queue.submit([full.finish()]))?;
         }
         let [columns, rows] = band.tiles();
         let mut pass = encoder.begin_compute_pass(&Default::default());
@@ -212,15 +210,10 @@ impl Workspace {
     }
 
     fn copy_back(&self, encoder: &mut wgpu::CommandEncoder) {
-        let contribution_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
-        encoder.copy_buffer_to_buffer(&self.stages.buffers.counters, 0, &self.staging, 0, COUNTERS_BYTES);
-        encoder.copy_buffer_to_buffer(
-            &self.stages.buffers.region_sums,
-            0,
-            &self.staging,
-            COUNTERS_BYTES,
-            contribution_bytes,
-        );
+        let n_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
+        let Buffers { counters, region_sums, .. } = &self.stages.buffers;
+        encoder.copy_buffer_to_buffer(counters, 0, &self.staging, 0, COUNTERS_BYTES);
+        encoder.copy_buffer_to_buffer(region_sums, 0, &self.staging, COUNTERS_BYTES, n_bytes);
     }
 
     fn read_back(
@@ -232,9 +225,7 @@ impl Workspace {
         self.staging.map_async(wgpu::MapMode::Read, .., |_| {});
         device.wait(submission)?;
         let bytes = self.staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
-        let mut counts: Counts = Zeroable::zeroed();
-        let (head, rest) = bytes.split_at(COUNTERS_BYTES as usize);
-        counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
+        let (counts, rest) = counts_and_rest(&bytes);
         let n_contributions = counts[Counter::RegionSums as usize];
         if self.fits(&counts) && n_contributions <= self.n_copied {
             take(&bytemuck::cast_slice(rest)[..n_contributions as usize]);
@@ -243,17 +234,14 @@ impl Workspace {
         self.staging.unmap();
         Ok(counts)
     }
+}
 
-    fn project(
-        &self,
-        device: &Device,
-        encoder: &mut wgpu::CommandEncoder,
-        chunk: &SceneChunk,
-        gaussians: &wgpu::Buffer,
-    ) {
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        self.stages.project(device, &mut pass, chunk, gaussians);
-    }
+/// What a staging buffer has: the counters, then what was copied behind them.
+fn counts_and_rest(staged: &[u8]) -> (Counts, &[u8]) {
+    let (head, rest) = staged.split_at(COUNTERS_BYTES as usize);
+    let mut counts: Counts = Zeroable::zeroed();
+    counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
+    (counts, rest)
 }
 
 pub(crate) struct Band<'a> {
@@ -279,16 +267,11 @@ pub(crate) fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::raster::gpu::device::adapters;
     use crate::raster::gpu::jobs::Scan;
+    use crate::raster::gpu::tests::first_gpu;
 
-    /// First GPU; `None` without one.
     fn opened(capacities: Capacities) -> Option<(Device, Workspace)> {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
-            return None;
-        };
-        let device = adapter.open(adapter.report.precision).expect("opens");
+        let device = first_gpu()?;
         let size = Size { capacities, n_tiles: 1, n_px: 1, n_chunk: 1 };
         let workspace = Workspace::new(&device, size).expect("there is memory");
         Some((device, workspace))
@@ -313,10 +296,8 @@ mod tests {
     /// 40 blocks of 2^27 pairs exceed 2^32: the total saturates at the largest number, which no buffer holds.
     #[test]
     fn counts_that_would_wrap_stay_at_the_largest() {
-        let Some((device, mut workspace)) = opened(Capacities { visible: 10_000, pairs: 1, entries: 1 })
-        else {
-            return;
-        };
+        let counts = Capacities { visible: 10_000, pairs: 1, entries: 1 };
+        let Some((device, workspace)) = opened(counts) else { return };
         for (of_block, expected) in [(1 << 20, 40 << 20), (1 << 27, u32::MAX)] {
             let Buffers { counters, block_counts, .. } = &workspace.stages.buffers;
             let mut counts: Counts = Zeroable::zeroed();
@@ -337,10 +318,8 @@ mod tests {
     /// repeat, which reveals an unstable sort.
     #[test]
     fn the_sort_is_stable_at_every_size() {
-        let Some((device, mut workspace)) = opened(Capacities { visible: 1, pairs: 1, entries: 70_000 })
-        else {
-            return;
-        };
+        let counts = Capacities { visible: 1, pairs: 1, entries: 70_000 };
+        let Some((device, mut workspace)) = opened(counts) else { return };
         workspace.set_region_bits(&device, bits_of(300));
         for n in [0, 1, 2, 255, 256, 257, 2047, 2048, 2049, 4096, 70_000] {
             let key = |i: u32, salt: u32| (i ^ salt).wrapping_mul(0x9e37_79b9) >> 8;

@@ -1,6 +1,7 @@
 //! Run-length masks of JSON files: SAM's lists and COCO data sets.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 use serde::Deserialize;
@@ -9,8 +10,8 @@ use slag_common::files;
 use crate::ingest::Undistorter;
 use crate::masks::regions::partition;
 use crate::masks::rle::{Rle, RleError};
-use crate::masks::{Bits, BoxPx, Mask, NO_REGION};
-use crate::segment::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput};
+use crate::masks::{Bits, BoxPx, Mask, NO_REGION, masks_of_labels};
+use crate::segment::{MAX_MASK_BYTES, SegmentError, SegmentInput};
 
 /// By file name, with indices in the file.
 pub(super) type MasksOfImage = BTreeMap<String, Vec<(usize, Rle)>>;
@@ -63,14 +64,14 @@ pub(super) fn read_list(path: &Path) -> Result<Vec<(usize, Rle)>, SegmentError> 
 /// A list of masks, or an object with a list as `annotations`.
 fn parse(path: &Path) -> Result<MaskFile, SegmentError> {
     let bytes = files::read(path)?;
-    let text = files::text_of(&bytes);
-    let text = text.map_err(|source| SegmentError::Text { path: path.to_owned(), source })?;
+    let text = files::text_of(&bytes).map_err(|error| SegmentError::of_file(path, error))?;
     let parsed = if text.trim_start().starts_with('[') {
         serde_json::from_str(text).map(|annotations| MaskFile { images: Vec::new(), annotations })
     } else {
         serde_json::from_str(text)
     };
-    parsed.map_err(|source| SegmentError::Json { path: path.to_owned(), source })
+    let expected = "expected SAM's list of masks, each with segmentation {size, counts}, or a COCO data set";
+    parsed.map_err(|error| SegmentError::of_file(path, format!("{error}; {expected}")))
 }
 
 fn rles_of(path: &Path, file: MaskFile) -> Result<Vec<(usize, Rle)>, SegmentError> {
@@ -80,7 +81,7 @@ fn rles_of(path: &Path, file: MaskFile) -> Result<Vec<(usize, Rle)>, SegmentErro
         let size_px = annotation.image_id.and_then(|id| sizes_px.get(&id).copied());
         match rle_of(annotation.segmentation, size_px) {
             Ok(rle) => Ok((index, rle)),
-            Err(source) => Err(SegmentError::Rle { path: path.to_owned(), index, source }),
+            Err(error) => Err(SegmentError::of_file(path, format!("mask {index}: {error}"))),
         }
     };
     file.annotations.into_iter().enumerate().map(rle).collect()
@@ -101,10 +102,14 @@ fn rle_of(segmentation: Segmentation, size_px: Option<[u32; 2]>) -> Result<Rle, 
     }
 }
 
+pub(super) fn inconsistent(path: &Path, what: &str) -> SegmentError {
+    SegmentError::of_file(path, format!("{what}; correct it, or export the data set again"))
+}
+
 pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     let file = parse(path)?;
     let image_ids: Vec<Option<u64>> = file.annotations.iter().map(|annotation| annotation.image_id).collect();
-    let inconsistent = |what: String| SegmentError::DataSet { path: path.to_owned(), what };
+    let inconsistent = |what: String| inconsistent(path, &what);
     let mut rles_of_id: BTreeMap<u64, Vec<(usize, Rle)>> = BTreeMap::new();
     let names: Vec<_> =
         file.images.iter().map(|image| (image.id, image.file_name.replace('\\', "/"))).collect();
@@ -161,8 +166,7 @@ pub(super) fn masks_of_rles(
     for (_, rle) in rles {
         check_size(path, rle.size_px(), input)?;
         let Some(box_px) = rle.box_px() else { continue };
-        let bytes = u64::from(box_px.width_px()) * u64::from(box_px.height_px());
-        left_bytes = left_bytes.checked_sub(bytes).ok_or_else(|| too_large(path))?;
+        left_bytes = left_bytes.checked_sub(box_px.area_px()).ok_or_else(|| too_large(path))?;
         masks.extend(rle.to_mask());
     }
     Ok(match input.undistorter {
@@ -181,52 +185,29 @@ pub(super) fn undistorted(
 ) -> Vec<Mask> {
     let (map, masks_of_region) = partition(masks, width_px, height_px, width_px, height_px, None);
     let labels = undistorter.labels(&map.region_of_pixel, NO_REGION);
-    let covered = || {
-        let with_position = labels.iter().zip(0_u32..).filter(|(region, _)| **region != NO_REGION);
-        with_position.map(|(region, at)| (*region as usize, at % width_px, at / width_px))
-    };
-
-    let empty = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
-    let join = |a: BoxPx, b: BoxPx| BoxPx {
-        x0: a.x0.min(b.x0),
-        y0: a.y0.min(b.y0),
-        x1: a.x1.max(b.x1),
-        y1: a.y1.max(b.y1),
-    };
-    let mut boxes = vec![(empty, 0); map.n_regions as usize];
-    for (region, x, y) in covered() {
-        let (box_px, area_px) = &mut boxes[region];
-        *box_px = join(*box_px, BoxPx { x0: x, y0: y, x1: x + 1, y1: y + 1 });
-        *area_px += 1;
+    let regions = masks_of_labels(&labels, width_px, map.n_regions as usize, u64::MAX).unwrap_or_default();
+    let mut parts_of_mask: Vec<Vec<&Mask>> = vec![Vec::new(); masks.len()];
+    for (region, part) in &regions {
+        masks_of_region[*region as usize].iter().for_each(|mask| parts_of_mask[*mask as usize].push(part));
     }
-    let mut ideal: Vec<Mask> = masks
-        .iter()
-        .map(|mask| Mask { box_px: empty, inside: Bits::default(), area_px: 0, level: mask.level })
-        .collect();
-    for ((box_px, area_px), members) in boxes.iter().zip(&masks_of_region).filter(|((_, area), _)| *area > 0)
-    {
-        for member in members {
-            let mask = &mut ideal[*member as usize];
-            mask.box_px = join(mask.box_px, *box_px);
-            mask.area_px += area_px;
+    let joined = |(mask, parts): (&Mask, Vec<&Mask>)| {
+        let box_px = parts.iter().map(|part| part.box_px).reduce(BoxPx::join)?;
+        let mut inside = Bits::of(false, box_px.area_px() as usize);
+        for part in &parts {
+            let BoxPx { x0, y0, x1, y1 } = part.box_px;
+            let pixels = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))).zip(part.inside.iter());
+            pixels.filter(|(_, is)| *is).for_each(|((x, y), _)| inside.set(box_px.place_of(x, y), true));
         }
-    }
-    for mask in ideal.iter_mut().filter(|mask| mask.area_px > 0) {
-        mask.inside = Bits::of(false, mask.box_px.width_px() as usize * mask.box_px.height_px() as usize);
-    }
-    for (region, x, y) in covered() {
-        for member in &masks_of_region[region] {
-            let mask = &mut ideal[*member as usize];
-            let row = (y - mask.box_px.y0) as usize * mask.box_px.width_px() as usize;
-            mask.inside.set(row + (x - mask.box_px.x0) as usize, true);
-        }
-    }
-    ideal.retain(|mask| mask.area_px > 0);
-    ideal
+        let area_px = parts.iter().map(|part| part.area_px).sum();
+        Some(Mask { box_px, inside, area_px, level: mask.level })
+    };
+    masks.iter().zip(parts_of_mask).filter_map(joined).collect()
 }
 
 pub(super) fn too_large(path: &Path) -> SegmentError {
-    SegmentError::TooLarge { path: path.to_owned(), limit_bytes: MAX_MASK_BYTES }
+    let advice = "remove stray pixels or give fewer masks";
+    let problem = format!("the bounding boxes of the masks exceed {MAX_MASK_BYTES} px in total; {advice}");
+    SegmentError::of_file(path, problem)
 }
 
 pub(super) fn check_size(
@@ -240,4 +221,79 @@ pub(super) fn check_size(
     }
     let view = input.view.name.clone();
     Err(SegmentError::Size { path: path.to_owned(), view, found_px: [width, height], expected_px })
+}
+
+/// Memory for the PNG decoder beside the pixels.
+const PNG_OVERHEAD_BYTES: usize = 1 << 20;
+
+/// Least number of values in the seams of a blurred image.
+const MIN_SOFT: usize = 8;
+/// Longest run of pixels in a seam.
+const MAX_SEAM_PX: usize = 2;
+
+/// Number of values in the seams of a mask image that was blurred, drawn with antialiasing or enlarged smoothly;
+/// `None` for one of ids. In seams, short runs have values between those beside them.
+pub(super) fn n_soft(ids: &[u32], width: usize) -> Option<usize> {
+    let mut values = BTreeSet::new();
+    let (mut n_between, mut n_runs) = (0, 0);
+    for row in ids.chunks_exact(width.max(1)) {
+        let runs: Vec<&[u32]> = row.chunk_by(u32::eq).collect();
+        for sides in runs.windows(3) {
+            let [low, value, high] = [sides[0][0], sides[1][0], sides[2][0]];
+            n_runs += 1;
+            if sides[1].len() <= MAX_SEAM_PX && (low.min(high) < value && value < low.max(high)) {
+                n_between += 1;
+                values.insert(value);
+            }
+        }
+    }
+    (values.len() >= MIN_SOFT && 4 * n_between > n_runs).then_some(values.len())
+}
+
+/// Ids of a PNG of the photo's size, row-major; of a palette, the indices.
+pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>, SegmentError> {
+    let failed = |error| SegmentError::of_file(path, format!("{error}; write the mask image again"));
+    let n_pixels = input.image.width() as usize * input.image.height() as usize;
+    let limits = png::Limits { bytes: 2 * n_pixels + PNG_OVERHEAD_BYTES };
+    let mut file = BufReader::new(files::open(path)?);
+    if let Some((what, advice)) = files::stand_in(file.fill_buf()?) {
+        return Err(SegmentError::of_file(path, format!("{what}; {advice}")));
+    }
+    let mut decoder = png::Decoder::new_with_limits(file, limits);
+    decoder.set_transformations(png::Transformations::IDENTITY);
+    let (width_px, height_px) = decoder.read_header_info().map_err(failed)?.size();
+    check_size(path, [width_px, height_px], input)?;
+    let mut reader = decoder.read_info().map_err(failed)?;
+    let (color, depth) = reader.output_color_type();
+    let other = match color {
+        png::ColorType::Grayscale | png::ColorType::Indexed => None,
+        png::ColorType::Rgb => Some("RGB"),
+        png::ColorType::GrayscaleAlpha => Some("gray and alpha"),
+        png::ColorType::Rgba => Some("RGBA"),
+    };
+    if let Some(other) = other {
+        let advice = "write a PNG with up to 16 bits of gray, or with a palette";
+        return Err(SegmentError::of_file(path, format!("found {other} pixels, expected ids; {advice}")));
+    }
+    // Bounded: at most 16 bits per pixel of the photo's size.
+    let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(0)];
+    let frame = reader.next_frame(&mut bytes).map_err(failed)?;
+    check_size(path, [frame.width, frame.height], input)?;
+
+    let mut ids = Vec::with_capacity(n_pixels);
+    let bits = depth as usize;
+    for row in bytes.chunks_exact(frame.line_size.max(1)).take(height_px as usize) {
+        match bits {
+            16 => {
+                ids.extend(row.chunks_exact(2).map(|pair| u32::from(u16::from_be_bytes([pair[0], pair[1]]))))
+            }
+            8 => ids.extend(row.iter().map(|byte| u32::from(*byte))),
+            // Several pixels per byte, the leftmost in the highest bits; each row starts at a byte.
+            _ => ids.extend((0..width_px as usize).map(|x| {
+                let shift = 8 - bits - x * bits % 8;
+                u32::from(row[x * bits / 8] >> shift) & ((1 << bits) - 1)
+            })),
+        }
+    }
+    Ok(ids)
 }

@@ -1,14 +1,13 @@
 //! Masks from files: id images, SAM's lists of run-length masks, COCO data sets.
 
 mod coco;
-mod id_image;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use slag_common::{Hash32, View, files};
 
-use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
+use super::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::masks::rle::Rle;
 use crate::masks::{Mask, NO_REGION, masks_of_labels};
 use coco::too_large;
@@ -91,7 +90,7 @@ impl GivenMasks {
                     "file_name {entry:?} is ambiguous: it may be {other:?} or {:?}; write the photo's folder into it",
                     view.name
                 );
-                return Err(SegmentError::DataSet { path: path.clone(), what });
+                return Err(coco::inconsistent(path, &what));
             }
         }
         Ok(())
@@ -130,9 +129,13 @@ impl GivenMasks {
         input: &SegmentInput<'_>,
         is_binary: bool,
     ) -> Result<Vec<Mask>, SegmentError> {
-        let mut labels = id_image::read_ids(path, input)?;
-        if let (false, Some(n)) = (is_binary, id_image::n_soft(&labels, input.image.width() as usize)) {
-            return Err(SegmentError::SoftEdges { path: path.to_owned(), n });
+        let mut labels = coco::read_ids(path, input)?;
+        if let (false, Some(n)) = (is_binary, coco::n_soft(&labels, input.image.width() as usize)) {
+            let problem = format!(
+                "soft edges: {n} values lie between others in seams of one or two pixels, expected an id for each mask; draw \
+                 masks without antialiasing, and enlarge them by the nearest pixel (cv2.INTER_NEAREST)"
+            );
+            return Err(SegmentError::of_file(path, problem));
         }
         // Soft edges are cut at half.
         let darkest = labels.iter().max().filter(|_| is_binary).map_or(1, |white| white / 2 + 1);
@@ -166,7 +169,7 @@ impl Segmenter for GivenMasks {
         let path = match &self.source {
             Source::Folder(path) | Source::DataSet { path, .. } => path,
         };
-        let view = first.name.clone();
+        let (view, n, of) = (&first.name, without.len(), views.len());
         if without.len() == views.len() {
             let found = self.names_found();
             let is_langsplat = found.iter().any(|name| name.ends_with("_s.npy") || name.ends_with("_f.npy"));
@@ -177,17 +180,17 @@ impl Segmenter for GivenMasks {
                 false => "",
             };
             let found = if found.is_empty() { "nothing".into() } else { found.join(", ") };
-            return Err(SegmentError::NoMatch { path: path.clone(), view, found, hint });
+            let problem = format!(
+                "no masks of any photo: for {view:?} expected a file of that name with the ending .png or .json (or a folder \
+                 with 0.png, 1.png ...), or a COCO file_name like it; found {found}{hint}"
+            );
+            return Err(SegmentError::of_file(path, problem));
         }
         if strict {
-            return Err(SegmentError::Missing {
-                path: path.clone(),
-                view,
-                n: without.len(),
-                of: views.len(),
-            });
+            let advice = "make them, or leave out --strict";
+            let problem = format!("{n} of {of} photos have no masks, the first is {view:?}; {advice}");
+            return Err(SegmentError::of_file(path, problem));
         }
-        let (n, of) = (without.len(), views.len());
         let missing = format!("{n} of {of} views have no masks in {}, the first is {view}", path.display());
         Ok(Some(
             [Some(missing), self.second_file(views)].into_iter().flatten().collect::<Vec<_>>().join("; "),
@@ -224,8 +227,12 @@ fn check_files(dir: &Path, views: &[View]) -> Result<(), SegmentError> {
     for view in views {
         let Some(path) = file_of(dir, view) else { continue };
         if let Some(first) = view_of_file.insert(path.clone(), &view.name) {
-            let (first, second) = (first.to_owned(), view.name.clone());
-            return Err(SegmentError::TwoPhotos { path, first, second });
+            let problem = format!(
+                "it may have the masks of {first:?} or of {:?}; name each file of masks after all of its photo's name, such as \
+                 {first}.png",
+                view.name
+            );
+            return Err(SegmentError::File { path, problem });
         }
     }
     Ok(())

@@ -7,28 +7,23 @@
 //! previous batch are enlarged and filtered in parallel.
 
 mod filter;
-mod points;
 mod runs;
-mod settings;
-#[cfg(test)]
-mod tests;
 mod upsample;
 
 use std::panic::resume_unwind;
 use std::path::Path;
 use std::sync::{Arc, mpsc};
 
+use filter::{Candidate, Filters};
+pub use filter::{SamLevels, SamSettings, ScoreFilter};
 use image::imageops;
 use slag_models::sam::{Decoded, Sam};
 use slag_models::{ModelError, SessionOptions};
-
-use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
-use crate::lanes::{GpuLoad, Lanes};
-use crate::masks::{BoxPx, Mask};
-use filter::{Candidate, Filters};
 use upsample::Upsampler;
 
-pub use settings::{SamLevels, SamSettings, ScoreFilter};
+use super::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
+use crate::lanes::{GpuLoad, Lanes};
+use crate::masks::{BoxPx, Mask};
 
 /// While the masks of some photos are filtered, the GPU has others.
 const MODELS_PER_GPU: usize = 2;
@@ -90,7 +85,7 @@ impl SamSegmenter {
         let embedding = sam.embed(&cropped)?;
         let SamSettings { points_per_side, points_per_batch, crop_points_divisor, .. } = self.settings;
         let n_per_side = (points_per_side / crop_points_divisor.saturating_pow(layer)).max(1);
-        let points = points::grid(n_per_side, width_px, height_px);
+        let points = grid(n_per_side, width_px, height_px);
         let points: Vec<[f32; 2]> =
             points.into_iter().map(|point| embedding.letterbox.point(point)).collect();
         let labels = vec![1; points_per_batch as usize];
@@ -103,7 +98,9 @@ impl SamSegmenter {
                 let mut left_bytes = MAX_MASK_BYTES;
                 for decoded in receiver {
                     if !input.install(|| filter::is_finite(&decoded)) {
-                        return Err(SegmentError::NotFinite { view: input.view.name.clone() });
+                        let advice = "run it with --provider cpu, or give another";
+                        let problem = format!("the mask model's output is not finite; {advice}");
+                        return Err(SegmentError::View { view: input.view.name.clone(), problem });
                     }
                     let upsampler = Upsampler::new(letterbox, decoded.logits_px);
                     let candidates = input.install(|| filters.candidates(&decoded, &upsampler, crop));
@@ -128,7 +125,9 @@ impl SamSegmenter {
 }
 
 fn too_many(input: &SegmentInput<'_>) -> SegmentError {
-    SegmentError::TooManyMasks { view: input.view.name.clone(), limit_bytes: MAX_MASK_BYTES }
+    let advice = "lower --points-per-side, or raise --sam-predicted-iou and --sam-stability";
+    let problem = format!("the masks found exceed {MAX_MASK_BYTES} bytes; {advice}");
+    SegmentError::View { view: input.view.name.clone(), problem }
 }
 
 impl Segmenter for SamSegmenter {
@@ -148,7 +147,7 @@ impl Segmenter for SamSegmenter {
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
         let (width_px, height_px) = input.image.dimensions();
         let filters = Filters { settings: &self.settings, image_px: [width_px, height_px] };
-        let crops = points::crops(width_px, height_px, self.settings.crop_layers, self.settings.crop_overlap);
+        let crops = crops(width_px, height_px, self.settings.crop_layers, self.settings.crop_overlap);
         let mut found = vec![Vec::new(); self.settings.levels.lists().len()];
         let mut left_bytes = MAX_MASK_BYTES;
         let sam = self.lanes.take();
@@ -161,10 +160,60 @@ impl Segmenter for SamSegmenter {
         drop(sam);
         let unique = |list| filters.unique_in_image(list, crops.len());
         let kept: Vec<Candidate> = input.install(|| found.into_iter().flat_map(unique).collect());
-        let area = |b: BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
-        if kept.iter().map(|candidate| area(candidate.mask.box_px)).sum::<u64>() > MAX_MASK_BYTES {
+        if kept.iter().map(|candidate| candidate.mask.box_px.area_px()).sum::<u64>() > MAX_MASK_BYTES {
             return Err(too_many(input));
         }
         Ok(kept.iter().map(|candidate| candidate.mask.to_mask(candidate.level)).collect())
+    }
+}
+
+/// Centres of `n_per_side` x `n_per_side` cells of an image, pixels, row by row.
+pub(super) fn grid(n_per_side: u32, width_px: u32, height_px: u32) -> Vec<[f64; 2]> {
+    let at = |i: u32, edge_px: u32| (f64::from(i) + 0.5) / f64::from(n_per_side) * f64::from(edge_px);
+    (0..n_per_side).flat_map(|y| (0..n_per_side).map(move |x| [at(x, width_px), at(y, height_px)])).collect()
+}
+
+/// Crops with their layers: the whole image as layer 0, and 2^i x 2^i crops for each further layer `i`. They overlap by
+/// `overlap_ratio` of the shorter edge in layer 1, half of that in each further layer.
+pub(super) fn crops(width_px: u32, height_px: u32, n_layers: u32, overlap_ratio: f64) -> Vec<(BoxPx, u32)> {
+    let mut crops = vec![(BoxPx { x0: 0, y0: 0, x1: width_px, y1: height_px }, 0)];
+    for layer in 1..=n_layers {
+        let n = 1_u32 << layer;
+        let overlap_px = (overlap_ratio * f64::from(width_px.min(height_px)) * (2.0 / f64::from(n))) as u32;
+        let len = |edge_px: u32| (overlap_px * (n - 1) + edge_px).div_ceil(n);
+        let (width, height) = (len(width_px), len(height_px));
+        for i in 0..n * n {
+            let (x0, y0) = ((width - overlap_px) * (i / n), (height - overlap_px) * (i % n));
+            let crop = BoxPx { x0, y0, x1: (x0 + width).min(width_px), y1: (y0 + height).min(height_px) };
+            // In tiny images, crops at the right and bottom may be empty.
+            if x0 < crop.x1 && y0 < crop.y1 {
+                crops.push((crop, layer));
+            }
+        }
+    }
+    crops
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn grids_and_crops_are_those_of_the_reference() {
+        let four = grid(2, 640, 480);
+        assert_eq!(four, [[160.0, 120.0], [480.0, 120.0], [160.0, 360.0], [480.0, 360.0]]);
+        assert_eq!(grid(32, 1000, 700).len(), 1024);
+        // By hand: the overlap is int(512 / 1500 * 480 * 2 / 2) = 163 px, then 81 px; a crop is
+        // ceil((163 + 640) / 2) = 402 px wide and ceil((163 + 480) / 2) = 322 px high, then 221 and 181 px.
+        let crops = crops(640, 480, 2, 512.0 / 1500.0);
+        assert_eq!(crops.len(), 1 + 4 + 16);
+        let edges = |k: usize| (crops[k].1, crops[k].0.x0, crops[k].0.y0, crops[k].0.x1, crops[k].0.y1);
+        assert_eq!(edges(0), (0, 0, 0, 640, 480));
+        assert_eq!(
+            [1, 2, 3, 4].map(edges),
+            [(1, 0, 0, 402, 322), (1, 0, 159, 402, 480), (1, 239, 0, 640, 322), (1, 239, 159, 640, 480),]
+        );
+        assert_eq!(edges(5), (2, 0, 0, 221, 181));
+        assert_eq!(edges(20), (2, 420, 300, 640, 480));
     }
 }

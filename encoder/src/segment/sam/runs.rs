@@ -36,12 +36,9 @@ impl RunMask {
     }
 
     pub(super) fn to_mask(&self, level: u8) -> Mask {
-        let BoxPx { x0, y0, .. } = self.box_px;
-        let width = self.box_px.width_px() as usize;
-        let mut inside = Bits::of(false, width * self.box_px.height_px() as usize);
+        let mut inside = Bits::of(false, self.box_px.area_px() as usize);
         for run in &self.runs {
-            let start = (run.y - y0) as usize * width;
-            (run.x0..run.x1).for_each(|x| inside.set(start + (x - x0) as usize, true));
+            (run.x0..run.x1).for_each(|x| inside.set(self.box_px.place_of(x, run.y), true));
         }
         Mask { box_px: self.box_px, inside, area_px: self.area_px, level }
     }

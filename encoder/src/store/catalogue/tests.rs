@@ -1,5 +1,5 @@
 use super::*;
-use crate::store::tests::manifest;
+use crate::store::tests::{manifest, new_store};
 use crate::store::{Extras, Store, StoreReader};
 
 fn files_of(folder: &Path, found: &mut Vec<PathBuf>) {
@@ -35,7 +35,7 @@ fn a_damaged_catalogue_is_made_anew_from_the_files() {
         files.iter().for_each(|path| damage(path));
         // Readers never trust a damaged catalogue.
         let seen = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies");
-        let generations = seen.map(|copy| copy.generations().expect("reads")).unwrap_or_default();
+        let generations = seen.map(|copy| copy.catalogue.generations().expect("reads")).unwrap_or_default();
         assert!(generations.iter().all(|record| record.n_cells <= 2), "damage {number}");
         let store = Store::create_or_open(dir.path()).unwrap_or_else(|e| panic!("damage {number}: {e}"));
         assert_eq!(store.next_generation().expect("reads"), 8, "damage {number}");
@@ -43,14 +43,13 @@ fn a_damaged_catalogue_is_made_anew_from_the_files() {
         let numbers: Vec<u64> = generations.iter().map(|record| record.generation).collect();
         assert_eq!(numbers, [6, 7], "damage {number}");
         store.publish(&manifest(8, &shards), &Extras::new()).expect("publishes");
-        assert!(StoreReader::open(dir.path()).expect("whole").listing().verify(|| {}).bad.is_empty());
+        assert!(StoreReader::open(dir.path()).expect("whole").verify(|| {}).bad.is_empty());
     }
 }
 
 #[test]
 fn the_catalogue_keeps_the_history() {
-    let dir = tempfile::tempdir().expect("a folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let shards: Vec<_> = ["a", "b", "c"].map(|text| store.put_bytes(text.as_bytes()).expect("room")).into();
     for generation in 1..=3 {
         let manifest = manifest(generation, &shards[..generation as usize]);
@@ -83,7 +82,7 @@ fn a_copy_is_read_while_a_writer_is_at_work() {
     fs_err::write(dir.path().join("tmp/7.part"), "of the writer").expect("writes");
     let before = snapshot_of(dir.path());
     let copy = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies").expect("there");
-    let generations = copy.generations().expect("reads");
+    let generations = copy.catalogue.generations().expect("reads");
     assert_eq!(generations.iter().map(|record| record.generation).collect::<Vec<_>>(), [1]);
     assert!(snapshot_of(dir.path()) == before, "the store was written to");
     drop(copy);

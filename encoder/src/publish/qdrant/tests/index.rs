@@ -25,12 +25,8 @@ fn with_quantization(quantization: Stored) -> CreateCollection {
 }
 
 fn scalar() -> ScalarQuantization {
-    ScalarQuantization {
-        r#type: QuantizationType::Int8.into(),
-        quantile: None,
-        always_ram: Some(true),
-        memory: None,
-    }
+    let r#type = QuantizationType::Int8.into();
+    ScalarQuantization { r#type, always_ram: Some(true), ..Default::default() }
 }
 
 fn graph() -> HnswConfigDiff {
@@ -48,13 +44,9 @@ const ALL: IndexSettings = IndexSettings {
 async fn a_collection_is_created_with_the_settings_given_and_no_others() {
     let none = IndexSettings::default();
     let hnsw = |hnsw| CreateCollection { hnsw_config: Some(hnsw), ..plain() };
-    let binary =
-        BinaryQuantization { encoding: None, query_encoding: None, always_ram: Some(true), memory: None };
-    let product = ProductQuantization {
-        compression: CompressionRatio::X16.into(),
-        always_ram: Some(true),
-        memory: None,
-    };
+    let binary = BinaryQuantization { always_ram: Some(true), ..Default::default() };
+    let compression = CompressionRatio::X16.into();
+    let product = ProductQuantization { compression, always_ram: Some(true), memory: None };
     let quantised = |quantisation| IndexSettings { quantisation: Some(quantisation), ..none };
     let cases = [
         (none, plain()),

@@ -19,7 +19,7 @@ use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHea
 use slag_math::random::Random;
 
 use super::*;
-use crate::store::tests::manifest_of_boxes;
+use crate::store::tests::{manifest_of_boxes, new_store};
 use crate::store::{Extras, Store};
 use server::Server;
 
@@ -39,8 +39,7 @@ struct Fixture {
 }
 
 fn fixture() -> Fixture {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (dir, store) = new_store();
     let mut fixture = Fixture { _dir: dir, store, truth: BTreeMap::new() };
     fixture.publish(1, 0);
     fixture

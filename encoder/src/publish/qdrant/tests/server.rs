@@ -159,13 +159,9 @@ fn passes(payload: &HashMap<String, Value>, filter: &Filter) -> Result<bool, Sta
             _ => Err(Status::unimplemented("a match that is no equality")),
         }
     };
+    assert!(filter.must.is_empty() && filter.should.is_empty());
     for condition in &filter.must_not {
         if holds(condition)? {
-            return Ok(false);
-        }
-    }
-    for condition in &filter.must {
-        if !holds(condition)? {
             return Ok(false);
         }
     }

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use crate::masks::BoxPx;
 use crate::segment::sam::filter::{Candidate, keep_by_score};
 use crate::segment::sam::runs::{Run, RunMask};
-use crate::segment::sam::settings::ScoreFilter;
+use crate::segment::sam::ScoreFilter;
 
 #[derive(Deserialize)]
 struct Recorded {
