@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::DVec3;
 use slag_common::container::{AlignedBytes, Layout, PREAMBLE_BYTES, SECTION_ROW_BYTES};
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{CellIndex, Manifest};
 use slag_common::shard::{self, ShardLayout};
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Gaussians, Hash32, poses};
@@ -140,7 +140,7 @@ pub fn manifest(data: &[u8]) -> bool {
     let Ok(manifest) = Manifest::parse(data) else { return false };
     let again = Manifest::parse(&manifest.to_bytes()).expect("a written manifest is read");
     assert_eq!(again, manifest);
-    manifest.cells_within(DVec3::ZERO, 1e9);
+    CellIndex::new(&manifest.cells).within(DVec3::ZERO, 1e9);
     let wanted = slag_edge::fetch::Wanted {
         profile: shard::Profile::Compact,
         centre_in_world: DVec3::ZERO,

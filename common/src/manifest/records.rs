@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -45,14 +44,6 @@ pub struct Manifest {
     pub n_rejected: u64,
     /// The cells, by ascending id.
     pub cells: Vec<CellRecord>,
-}
-
-impl Manifest {
-    /// Returns the positions of the cells whose box is within a radius of a point, ascending.
-    pub fn cells_within(&self, centre_in_world: DVec3, radius: f64) -> Vec<usize> {
-        let is_near = |at: &usize| self.cells[*at].bounds.distance_to(centre_in_world) <= radius;
-        (0..self.cells.len()).filter(is_near).collect()
-    }
 }
 
 /// The encoder that made a scene's embeddings.

@@ -1,4 +1,5 @@
 use glam::DVec3;
+use proptest::prelude::*;
 
 use super::*;
 use crate::frames::Aabb;
@@ -83,4 +84,24 @@ fn manifests_above_64_mib_are_refused() {
         matches!(error, ManifestError::TooLong { len_bytes: found } if found == len_bytes as u64)
     };
     assert_eq!((parse(64 << 20), parse((64 << 20) + 1)), (false, true));
+}
+
+proptest! {
+    /// Oracle: brute force over the boxes.
+    #[test]
+    fn radius_search_equals_brute_force(
+        boxes in prop::collection::vec((prop::array::uniform3(-50.0..50.0f64), prop::array::uniform3(0.0..20.0f64)), 0..60),
+        centre in prop::array::uniform3(-60.0..60.0f64), radius in 0.0..50.0f64,
+    ) {
+        let template = manifest(1).cells.remove(0);
+        let cells: Vec<CellRecord> = boxes.iter().map(|(min, size)| {
+            let min = DVec3::from(*min);
+            CellRecord { bounds: Aabb { min, max: min + DVec3::from(*size) }, ..template.clone() }
+        }).collect();
+        let expected: Vec<usize> = (0..cells.len()).filter(|i| {
+            let nearest = DVec3::from(centre).clamp(cells[*i].bounds.min, cells[*i].bounds.max);
+            nearest.distance_squared(centre.into()) <= radius * radius
+        }).collect();
+        prop_assert_eq!(CellIndex::new(&cells).within(centre.into(), radius), expected);
+    }
 }

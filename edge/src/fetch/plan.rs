@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 use slag_common::Hash32;
-use slag_common::manifest::{Manifest, ObjectRecord, TextModelRecord};
+use slag_common::manifest::{CellIndex, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::Profile;
 
 use super::position::PlanError;
@@ -49,7 +49,7 @@ impl Plan {
             let (name, expected) = ("radius", "zero or more, and finite");
             return Err(PlanError::Number { name, value: radius, expected });
         }
-        let positions = manifest.cells_within(centre_in_world, radius);
+        let positions = CellIndex::new(&manifest.cells).within(centre_in_world, radius);
         if positions.is_empty() {
             let distances = manifest.cells.iter().map(|cell| cell.bounds.distance_to(centre_in_world));
             let nearest = distances.fold(f64::INFINITY, f64::min);

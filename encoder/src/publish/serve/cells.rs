@@ -106,7 +106,7 @@ pub(super) async fn cells(
     let search = move |snapshot: &Snapshot| {
         let manifest = snapshot.world();
         let (centre, radius) = query.ball_in_world(manifest)?;
-        let near = manifest.cells_within(centre, radius).into_iter().map(|i| &manifest.cells[i]);
+        let near = snapshot.index.within(centre, radius).into_iter().map(|i| &manifest.cells[i]);
         let cells = near.map(|cell| CellAnswer {
             cell_id: cell.cell_id,
             bounds: cell.bounds,

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use axum::body::Bytes;
 use axum::extract::State;
 use slag_common::Hash32;
-use slag_common::manifest::{self, Manifest};
+use slag_common::manifest::{self, CellIndex, Manifest};
 use slag_common::tuf::TargetFile;
 use slag_service::listener::ConnectionLimits;
 use slag_service::metrics::{Exposition, ResponseCounts};
@@ -48,6 +48,7 @@ impl Default for Limits {
 pub(super) struct Snapshot {
     pub(super) reader: StoreReader,
     pub(super) manifest: Bytes,
+    pub(super) index: CellIndex,
     /// Lengths of the shards of the current and the previous manifest.
     pub(super) objects: BTreeMap<Hash32, u64>,
     /// Current and previous manifest by their target names.
@@ -65,6 +66,7 @@ impl Snapshot {
         Ok(Self {
             targets: both().filter_map(|published| target(&published.bytes)).collect(),
             manifest: reader.current().bytes.clone().into(),
+            index: CellIndex::new(&reader.manifest().cells),
             objects: both().flat_map(|published| published.object_lens()).collect(),
             reader,
         })
