@@ -1,5 +1,5 @@
-//! Relations between things, judged on generated scenes: questions are asked of the robot's program, and the answers
-//! are compared with the layout.
+//! Relations between things, judged on generated scenes: each question is asked of the robot's program as
+//! relations, as the plain phrase, and by the noun alone, and the answers are compared with the layout.
 
 mod truth;
 
@@ -20,7 +20,7 @@ use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
-use truth::{RELATIONS, Relation};
+use truth::Asked;
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
@@ -50,14 +50,15 @@ pub(crate) struct RelationsArgs {
 }
 
 struct Question {
-    relation: &'static Relation,
+    asked: Asked,
+    thing: String,
     text: String,
     /// Indices of the things meant; empty if there is none.
     truth: Vec<usize>,
 }
 
 pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<RelationsReport> {
-    let mut counts = BTreeMap::new();
+    let mut report = RelationsReport::default();
     let scenes = Prepared {
         out: &args.out,
         kinds: &args.kind,
@@ -66,38 +67,33 @@ pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<Relat
         walk: Walk::Oval,
         encode_flags: &[],
     };
-    let scenes = scenes.judge(progress, |_, _, dir| judge(dir, &mut counts))?;
-    let row = |relation, has_answer, counts| Row { relation, has_answer, counts };
-    let mut rows: Vec<Row> = counts.iter().map(|((relation, has), of)| row(*relation, *has, *of)).collect();
-    for has_answer in [true, false] {
-        let mut total = Counts::default();
-        counts.iter().filter(|((_, has), _)| *has == has_answer).for_each(|(_, counts)| total.add(*counts));
-        rows.push(row("all", has_answer, total));
-    }
-    Ok(RelationsReport { scenes, rows })
+    report.scenes = scenes.judge(progress, |_, _, dir| judge(dir, &mut report))?;
+    Ok(report)
 }
 
-/// By relation, and whether a thing is meant.
-type AllCounts = BTreeMap<(&'static str, bool), Counts>;
-
-fn judge(dir: &Path, all: &mut AllCounts) -> Result<()> {
+fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
     let (things, _) = read_things(&dir.join("scene"))?;
     let robot = middle(&things);
     let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
-    for Question { relation, text, truth } in questions(&things, robot) {
-        let answered = ask(&service, &text, robot)?;
-        let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
-        let is_right = |at: &Option<usize>| at.is_some_and(|at| truth.contains(&at));
-        let distinct: BTreeSet<usize> = found.iter().copied().flatten().collect();
-        let counts = Counts {
-            n_questions: 1,
-            n_right: usize::from(found.first().map_or(truth.is_empty(), is_right)),
-            n_answers: found.len(),
-            n_answers_right: found.iter().filter(|at| is_right(at)).count(),
-            n_meant: truth.len(),
-            n_meant_found: distinct.iter().filter(|at| truth.contains(at)).count(),
-        };
-        all.entry((relation.text, !truth.is_empty())).or_default().add(counts);
+    for question in questions(&things, robot) {
+        for way in Way::ALL {
+            let answered = ask(&service, &question, way, robot)?;
+            let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
+            let is_right = |at: &Option<usize>| at.is_some_and(|at| question.truth.contains(&at));
+            let distinct: BTreeSet<usize> = found.iter().copied().flatten().collect();
+            let counts = Counts {
+                n_questions: 1,
+                n_right: usize::from(match found.first() {
+                    Some(first) => is_right(first),
+                    None => question.truth.is_empty(),
+                }),
+                n_answers: found.len(),
+                n_answers_right: found.iter().filter(|at| is_right(at)).count(),
+                n_meant: question.truth.len(),
+                n_meant_found: distinct.iter().filter(|at| question.truth.contains(at)).count(),
+            };
+            report.count(question.asked, !question.truth.is_empty(), way, counts);
+        }
     }
     Ok(())
 }
@@ -123,7 +119,7 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     let several = n_of_kind.into_iter().filter(|(_, n)| *n > 1).map(|(kind, _)| kind);
     let ones: Vec<&str> = nouns.iter().copied().chain(several).collect();
     let mut all = Vec::new();
-    for relation in &RELATIONS {
+    for asked in Asked::ALL {
         let mut of_relation: [Vec<Question>; 2] = [Vec::new(), Vec::new()];
         for thing in &ones {
             for of in nouns.iter().filter(|of| *of != thing) {
@@ -133,14 +129,14 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
                 if n_of != 1 || things.iter().any(is_part) {
                     continue;
                 }
-                let truth = relation.meant(things, thing, of, robot);
+                let truth = truth::meant(things, asked, thing, of, robot);
                 // The thing that a picked one is compared with must be visible.
                 if truth.iter().any(|at| things[*at].train_pixels < MIN_PIXELS) {
                     continue;
                 }
-                let text = relation.question(thing, of);
+                let text = asked.text(thing, of);
                 let has_answer = usize::from(!truth.is_empty());
-                of_relation[has_answer].push(Question { relation, text, truth });
+                of_relation[has_answer].push(Question { asked, thing: (*thing).to_owned(), text, truth });
             }
         }
         for questions in of_relation {
@@ -151,14 +147,20 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     all
 }
 
-fn ask(service: &Service, text: &str, robot: DVec3) -> Result<Vec<Value>> {
-    let body = json!({"texts": [text], "near": [robot.x, robot.y, 0.0], "limit": LIMIT});
+fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result<Vec<Value>> {
+    let near = [robot.x, robot.y, 0.0];
+    // Distance must not affect the plain phrase, so it is asked without a position.
+    let body = match way {
+        Way::Relations => json!({"texts": [question.text], "near": near, "limit": LIMIT}),
+        Way::Phrase => json!({"texts": [question.text], "relations": false, "limit": LIMIT}),
+        Way::Noun => json!({"texts": [question.thing], "relations": false, "limit": LIMIT}),
+    };
     let mut reply = service.post("/v1/query", &body)?;
     match reply["results"][0]["answers"].take() {
         Value::Array(answers) => Ok(answers),
         // 422: words unknown to the model.
         _ if reply["status"] == 422 => Ok(Vec::new()),
-        _ => Err(anyhow!("{text}: {}", reply["detail"])),
+        _ => Err(anyhow!("{}: {}", question.text, reply["detail"])),
     }
 }
 
@@ -187,6 +189,20 @@ fn iou(a: &Aabb, b: &Aabb) -> f64 {
     if both > 0.0 { shared / both } else { 0.0 }
 }
 
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+enum Way {
+    Relations,
+    /// The phrase as one text, with the scene's threshold.
+    Phrase,
+    /// The noun alone, with the scene's threshold.
+    Noun,
+}
+
+impl Way {
+    const ALL: [Self; 3] = [Self::Relations, Self::Phrase, Self::Noun];
+}
+
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 struct Counts {
     n_questions: usize,
@@ -212,29 +228,63 @@ impl Counts {
 
 #[derive(Clone, Debug, Serialize)]
 struct Row {
-    /// Its question, or `all`.
-    relation: &'static str,
+    /// `None` for all of them.
+    relation: Option<Asked>,
     has_answer: bool,
+    way: Way,
     #[serde(flatten)]
     counts: Counts,
 }
 
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct RelationsReport {
     scenes: Vec<String>,
-    rows: Vec<Row>,
+    counts: BTreeMap<(Asked, bool, Way), Counts>,
+}
+
+impl RelationsReport {
+    /// Adds what came of a question. `has_answer`: whether a thing is meant.
+    fn count(&mut self, asked: Asked, has_answer: bool, way: Way, counts: Counts) {
+        self.counts.entry((asked, has_answer, way)).or_default().add(counts);
+    }
+
+    fn rows(&self) -> Vec<Row> {
+        let row = |relation, has_answer, way, counts| Row { relation, has_answer, way, counts };
+        let each =
+            self.counts.iter().map(|((asked, has, way), counts)| row(Some(*asked), *has, *way, *counts));
+        let total = |(has_answer, way)| {
+            let mut total = Counts::default();
+            let of = self.counts.iter().filter(|((_, has, by), _)| *has == has_answer && *by == way);
+            of.for_each(|(_, counts)| total.add(*counts));
+            row(None, has_answer, way, total)
+        };
+        let totals = [true, false].into_iter().flat_map(|has| Way::ALL.map(|way| (has, way)));
+        each.chain(totals.map(total)).collect()
+    }
+}
+
+impl Serialize for RelationsReport {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        #[derive(Serialize)]
+        struct Report<'a> {
+            scenes: &'a [String],
+            rows: Vec<Row>,
+        }
+        Report { scenes: &self.scenes, rows: self.rows() }.serialize(to)
+    }
 }
 
 impl fmt::Display for RelationsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
-        let columns = ["relation", "answer", "questions", "best right", "precision", "recall"];
+        let columns = ["relation", "answer", "asked as", "questions", "best right", "precision", "recall"];
         let mut table = Table::new(columns);
-        for Row { relation, has_answer, counts } in &self.rows {
+        for Row { relation, has_answer, way, counts } in self.rows() {
             let percent = |n: usize, of: usize| percent(n as u64, of as u64);
             table.row([
-                (*relation).to_owned(),
-                if *has_answer { "some" } else { "none" }.to_owned(),
+                relation.map_or("all".into(), |relation| format!("{relation:?}")),
+                if has_answer { "some" } else { "none" }.to_owned(),
+                format!("{way:?}"),
                 counts.n_questions.to_string(),
                 percent(counts.n_right, counts.n_questions),
                 percent(counts.n_answers_right, counts.n_answers),

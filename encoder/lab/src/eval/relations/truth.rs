@@ -2,6 +2,7 @@
 //! share no code with the robot's.
 
 use glam::{DVec2, DVec3};
+use serde::Serialize;
 use slag_common::frames::Aabb;
 
 use crate::eval::truth::Thing;
@@ -19,40 +20,50 @@ const TOUCHES_M: f64 = 0.05;
 /// Least height above the ground of a thing that stands on another.
 const RAISED_M: f64 = 0.1;
 
-/// Which of the things that are named a question means.
-enum Rule {
-    /// Those in a relation to the other thing, as seen by the robot.
-    Related(fn(&Thing, &Thing, DVec3) -> bool),
-    /// The one of this place by distance from the other thing, counted from 0.
-    ByDistance(usize),
-    /// The largest of those near the other thing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Asked {
+    On,
+    Near,
+    Beside,
+    LeftOf,
+    RightOf,
+    InFrontOf,
+    Behind,
+    Nearest,
+    Second,
     Largest,
 }
 
-pub(super) struct Relation {
-    /// A question about a `THING` in this relation to an `OTHER` one.
-    pub(super) text: &'static str,
-    rule: Rule,
-}
+impl Asked {
+    pub(super) const ALL: [Self; 10] = [
+        Self::On,
+        Self::Near,
+        Self::Beside,
+        Self::LeftOf,
+        Self::RightOf,
+        Self::InFrontOf,
+        Self::Behind,
+        Self::Nearest,
+        Self::Second,
+        Self::Largest,
+    ];
 
-pub(super) const RELATIONS: [Relation; 10] = [
-    Relation { text: "THING on the OTHER", rule: Rule::Related(|a, b, _| is_on(a, b)) },
-    Relation { text: "THING near the OTHER", rule: Rule::Related(|a, b, _| gap(a, b) <= NEAR_M) },
-    Relation {
-        text: "THING beside the OTHER",
-        rule: Rule::Related(|a, b, _| gap(a, b) <= BESIDE_M && is_level(a, b)),
-    },
-    Relation { text: "THING left of the OTHER", rule: Rule::Related(|a, b, at| is_seen(a, b, at, 90.0)) },
-    Relation { text: "THING right of the OTHER", rule: Rule::Related(|a, b, at| is_seen(a, b, at, -90.0)) },
-    Relation {
-        text: "THING in front of the OTHER",
-        rule: Rule::Related(|a, b, at| is_seen(a, b, at, 180.0)),
-    },
-    Relation { text: "THING behind the OTHER", rule: Rule::Related(|a, b, at| is_seen(a, b, at, 0.0)) },
-    Relation { text: "nearest THING to the OTHER", rule: Rule::ByDistance(0) },
-    Relation { text: "second THING from the OTHER", rule: Rule::ByDistance(1) },
-    Relation { text: "largest THING near the OTHER", rule: Rule::Largest },
-];
+    pub(super) fn text(self, thing: &str, of: &str) -> String {
+        match self {
+            Self::On => format!("{thing} on the {of}"),
+            Self::Near => format!("{thing} near the {of}"),
+            Self::Beside => format!("{thing} beside the {of}"),
+            Self::LeftOf => format!("{thing} left of the {of}"),
+            Self::RightOf => format!("{thing} right of the {of}"),
+            Self::InFrontOf => format!("{thing} in front of the {of}"),
+            Self::Behind => format!("{thing} behind the {of}"),
+            Self::Nearest => format!("nearest {thing} to the {of}"),
+            Self::Second => format!("second {thing} from the {of}"),
+            Self::Largest => format!("largest {thing} near the {of}"),
+        }
+    }
+}
 
 impl Thing {
     pub(super) fn bounds(&self) -> Aabb {
@@ -77,36 +88,38 @@ impl Thing {
     }
 }
 
-impl Relation {
-    pub(super) fn question(&self, thing: &str, of: &str) -> String {
-        self.text.replace("THING", thing).replace("OTHER", of)
-    }
-
-    /// Returns the indices of the things that the question means. `robot`: where it is asked.
-    pub(super) fn meant(&self, things: &[Thing], thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
-        let named = |word: &str| -> Vec<usize> {
-            (0..things.len()).filter(|at| things[*at].sounds_like(word)).collect()
-        };
-        let (ones, others) = (named(thing), named(of));
-        let related = |holds: &dyn Fn(&Thing, &Thing) -> bool| -> Vec<usize> {
-            let is_related =
-                |at: &usize| others.iter().any(|other| other != at && holds(&things[*at], &things[*other]));
-            ones.iter().copied().filter(is_related).collect()
-        };
-        match &self.rule {
-            Rule::Related(holds) => related(&|a, b| holds(a, b, robot)),
-            Rule::ByDistance(place) => {
-                let Some(from) = others.first() else { return Vec::new() };
-                let mut sorted: Vec<usize> = ones.iter().copied().filter(|at| at != from).collect();
-                let distance = |at: &usize| gap(&things[*at], &things[*from]);
-                sorted.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
-                sorted.get(*place).copied().into_iter().collect()
-            }
-            Rule::Largest => {
-                let near = related(&|a, b| gap(a, b) <= NEAR_M).into_iter();
-                let volume = |at: &usize| things[*at].volume();
-                near.max_by(|a, b| volume(a).total_cmp(&volume(b))).into_iter().collect()
-            }
+/// Returns the indices of the things that a question means. `robot`: where it is asked.
+pub(super) fn meant(things: &[Thing], asked: Asked, thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
+    let named =
+        |word: &str| -> Vec<usize> { (0..things.len()).filter(|at| things[*at].sounds_like(word)).collect() };
+    let (ones, others) = (named(thing), named(of));
+    let related = |holds: &dyn Fn(&Thing, &Thing) -> bool| -> Vec<usize> {
+        let is_related =
+            |at: &usize| others.iter().any(|other| other != at && holds(&things[*at], &things[*other]));
+        ones.iter().copied().filter(is_related).collect()
+    };
+    let by_distance = |n: usize| -> Vec<usize> {
+        let Some(from) = others.first() else { return Vec::new() };
+        let mut sorted: Vec<usize> = ones.iter().copied().filter(|at| at != from).collect();
+        sorted.sort_by(|a, b| gap(&things[*a], &things[*from]).total_cmp(&gap(&things[*b], &things[*from])));
+        sorted.get(n).copied().into_iter().collect()
+    };
+    match asked {
+        Asked::On => related(&is_on),
+        Asked::Near => related(&|a, b| gap(a, b) <= NEAR_M),
+        Asked::Beside => related(&|a, b| gap(a, b) <= BESIDE_M && is_level(a, b)),
+        Asked::LeftOf => related(&|a, b| is_seen(a, b, robot, 90.0)),
+        Asked::RightOf => related(&|a, b| is_seen(a, b, robot, -90.0)),
+        Asked::InFrontOf => related(&|a, b| is_seen(a, b, robot, 180.0)),
+        Asked::Behind => related(&|a, b| is_seen(a, b, robot, 0.0)),
+        Asked::Nearest => by_distance(0),
+        Asked::Second => by_distance(1),
+        Asked::Largest => {
+            let near = related(&|a, b| gap(a, b) <= NEAR_M);
+            near.into_iter()
+                .max_by(|a, b| things[*a].volume().total_cmp(&things[*b].volume()))
+                .into_iter()
+                .collect()
         }
     }
 }
@@ -156,18 +169,15 @@ mod tests {
         ];
         // From the south, looking north.
         let robot = DVec3::new(0.8, -3.0, 0.0);
-        let meant = |text: &str, one, other| {
-            let relation = RELATIONS.iter().find(|relation| relation.text == text).expect("a relation");
-            relation.meant(&things, one, other, robot)
-        };
-        assert_eq!(meant("THING on the OTHER", "mug", "table"), [1]);
-        assert_eq!(meant("THING on the OTHER", "chair", "table"), [0usize; 0]);
-        assert_eq!(meant("THING near the OTHER", "chair", "table"), [2]);
-        assert_eq!(meant("THING beside the OTHER", "furniture", "chair"), [0]);
-        assert_eq!(meant("THING right of the OTHER", "chair", "table"), [2, 3]);
-        assert_eq!(meant("THING left of the OTHER", "chair", "table"), [0usize; 0]);
-        assert_eq!(meant("nearest THING to the OTHER", "chair", "table"), [2]);
-        assert_eq!(meant("second THING from the OTHER", "chair", "table"), [3]);
-        assert_eq!(meant("largest THING near the OTHER", "furniture", "mug"), [0]);
+        let meant = |asked, one, other| meant(&things, asked, one, other, robot);
+        assert_eq!(meant(Asked::On, "mug", "table"), [1]);
+        assert_eq!(meant(Asked::On, "chair", "table"), [0usize; 0]);
+        assert_eq!(meant(Asked::Near, "chair", "table"), [2]);
+        assert_eq!(meant(Asked::Beside, "furniture", "chair"), [0]);
+        assert_eq!(meant(Asked::RightOf, "chair", "table"), [2, 3]);
+        assert_eq!(meant(Asked::LeftOf, "chair", "table"), [0usize; 0]);
+        assert_eq!(meant(Asked::Nearest, "chair", "table"), [2]);
+        assert_eq!(meant(Asked::Second, "chair", "table"), [3]);
+        assert_eq!(meant(Asked::Largest, "furniture", "mug"), [0]);
     }
 }
