@@ -359,8 +359,12 @@ impl ViewCheck {
     /// Returns whether the drawing looks more like the photo than its mean colour does, or much like it: of a bare wall
     /// the mean colour is hard to surpass.
     pub fn fits(&self) -> bool {
-        self.psnr_db >= self.flat_psnr_db.min(ALIKE_DB)
+        looks_alike(self.psnr_db, self.flat_psnr_db)
     }
+}
+
+pub(super) fn looks_alike(psnr_db: f64, flat_psnr_db: f64) -> bool {
+    psnr_db >= flat_psnr_db.min(ALIKE_DB)
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -13,8 +13,8 @@ mod view;
 use slag_common::{Gaussians, durable};
 
 use crate::ingest::IngestError;
-use crate::raster::Rasterizer;
-use diagnosis::{FLAWLESS_DB, Means, Samples};
+use crate::raster::{LoadedScene, Rasterizer};
+use diagnosis::{FLAWLESS_DB, Means, Samples, looks_alike};
 use view::{PLAIN_DB, at_width, mean, picture, picture_name};
 
 pub(crate) use diagnosis::ViewCheck;
@@ -23,6 +23,9 @@ pub(crate) use mistake::Alignment;
 pub use mistake::{FrameCandidate, FrameCause, Mistake, align, nerfstudio_defaults};
 pub use suspicion::{Suspicion, suspicions};
 pub use view::{CheckError, CheckView, psnr_db};
+
+/// Width at which an encode compares views.
+const QUICK_WIDTH_PX: u32 = 240;
 
 /// Draws the views of a scene and compares them with their photos.
 ///
@@ -103,6 +106,17 @@ where
         notes: Vec::new(),
         diagnosis,
     })
+}
+
+/// Whether a drawing looks less like its photo than a plain colour does; `None` of a photo that has one colour.
+pub(crate) fn is_unlike(photo: CheckView, scene: &dyn LoadedScene) -> Result<Option<bool>, CheckError> {
+    let small = at_width(&photo, QUICK_WIDTH_PX)?;
+    if small.is_plain() {
+        return Ok(None);
+    }
+    let drawing = small.draw(scene)?;
+    let psnr_db = small.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
+    Ok(Some(!looks_alike(psnr_db, small.flat_psnr_db())))
 }
 
 fn means_of(checks: &[ViewCheck]) -> Means {

@@ -5,7 +5,7 @@ use std::io::Cursor;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat, RgbImage};
 
-use crate::ingest::IngestError;
+use crate::ingest::{IngestError, LoadedImage};
 use crate::raster::{Drawing, LoadedScene, RasterError, RasterView};
 
 #[derive(Clone, Debug)]
@@ -16,6 +16,15 @@ pub struct CheckView {
     pub valid: Option<GrayImage>,
     /// At the photo's resolution.
     pub view: RasterView,
+}
+
+impl From<LoadedImage> for CheckView {
+    fn from(loaded: LoadedImage) -> Self {
+        let LoadedImage { view, image, valid, .. } = loaded;
+        let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());
+        let valid = bytes.and_then(|bytes| GrayImage::from_raw(image.width(), image.height(), bytes));
+        Self { view: RasterView::of(&view), name: view.name, image, valid }
+    }
 }
 
 /// Scales a view down to a width, the photo with a filter that averages over the pixels it drops.

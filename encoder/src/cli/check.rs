@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
-use image::GrayImage;
 use slag_common::poses::SplatFrame;
 use slag_common::{View, durable, files, poses, splat};
 
@@ -12,8 +11,7 @@ use super::common::{Exit, InputArgs, print};
 use super::memory::free_memory_bytes;
 use super::{common, next};
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
-use crate::ingest::{self, FoundFrame, IngestError, LoadedImage, OddPhotos};
-use crate::raster::RasterView;
+use crate::ingest::{self, FoundFrame, IngestError, OddPhotos};
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 
@@ -147,10 +145,7 @@ fn load(view: &View, odd: &OddPhotos) -> Result<CheckView, IngestError> {
     ingest::check_memory(view, free_memory_bytes().unwrap_or(u64::MAX))?;
     let loaded = ingest::load_image(view)?;
     odd.add(&loaded);
-    let LoadedImage { view, image, valid, .. } = loaded;
-    let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());
-    let valid = bytes.and_then(|bytes| GrayImage::from_raw(image.width(), image.height(), bytes));
-    Ok(CheckView { view: RasterView::of(&view), name: view.name, image, valid })
+    Ok(loaded.into())
 }
 
 /// Returns the similarities to try; all begin after `frame`, if given.

@@ -326,7 +326,11 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
         let written = durable::write_result(path, |file| file.write_all(report.as_ref()));
         written.context("the store is published, but the report is not written")?;
     }
-    Ok(if summary.is_whole() { Exit::Done } else { Exit::Partly })
+    Ok(match (summary.fits(), summary.is_whole()) {
+        (false, _) => Exit::Mismatch,
+        (true, false) => Exit::Partly,
+        (true, true) => Exit::Done,
+    })
 }
 
 /// A target instead of a preset.

@@ -1,10 +1,13 @@
 //! The first step: everything that is read, checked and decided before the first view.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
 use slag_common::Hash32;
+use slag_common::manifest::Manifest;
+use slag_common::shard::Profile;
 use slag_models::SessionOptions;
 
 use super::context::{Engines, RunContext};
@@ -24,7 +27,10 @@ use crate::segment::{
     GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter, WithStanding,
 };
 use crate::store::{Store, StoreReader};
-use crate::{landmarks, objects, shard};
+use crate::{check, ingest, landmarks, objects, shard};
+
+/// Number of views whose drawings are compared with their photos.
+const N_COMPARED: usize = 4;
 
 pub(crate) struct Plan<'a> {
     pub(crate) context: &'a RunContext<'a>,
@@ -38,6 +44,8 @@ pub(crate) struct Plan<'a> {
     pub(super) lost_views: Option<LostViews>,
     /// Encoder of the replaced generation, if it is another.
     pub(super) encoder_before: Option<String>,
+    /// Of the compared views those that look less like their photo than a plain colour does, and all.
+    pub(super) n_unlike: [usize; 2],
     pub(super) scene: Box<dyn LoadedScene + 'a>,
     /// Indices of the views to use, in order.
     pub(crate) order: Vec<usize>,
@@ -88,6 +96,7 @@ pub(super) fn plan<'a>(
     let lost_views = lost_views(store, of_scene)?;
     let job = Job::open(store, of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
+    let n_unlike = context.install(|| unlike(inputs, scene.as_ref()));
     let start = Instant::now();
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
@@ -102,7 +111,8 @@ pub(super) fn plan<'a>(
         segmenter,
         job,
         lost_views,
-        encoder_before: encoder_before(settings, engines),
+        encoder_before: encoder_before(settings, inputs, engines),
+        n_unlike,
         scene,
         order,
         coverage,
@@ -114,11 +124,20 @@ pub(super) fn plan<'a>(
     Ok(Plan { memory, ..plan })
 }
 
-/// Encoder of the store's generation, if this encode publishes another's vectors: robots refuse them until they have
-/// its text model.
-fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<String> {
+/// Warns of what robots lose by this encode. Returns the encoder of the store's generation, if this encode publishes
+/// another's vectors: robots refuse them until they have its text model.
+fn encoder_before(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>) -> Option<String> {
     // Without a generation, or with a damaged one, there is nothing to report.
     let reader = StoreReader::open(&settings.output.store).ok()?;
+    let lost = lost(reader.manifest(), settings, inputs);
+    if !lost.is_empty() {
+        tracing::warn!(
+            "{}: its generation {} has {}; this encode has not, and robots that use that fail after their next fetch",
+            settings.output.store.display(),
+            reader.manifest().generation,
+            lost.join(", ")
+        );
+    }
     let (before, now) = (&reader.manifest().encoder, engines.models.encoder_id());
     if before.id == Hash32(now.hash()) {
         return None;
@@ -137,6 +156,45 @@ fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<St
         before.name
     );
     Some(before.name.clone())
+}
+
+/// What a generation has and the next will not, with the flag that keeps it.
+fn lost(before: &Manifest, settings: &EncodeSettings, inputs: &Inputs) -> Vec<String> {
+    let is_geographic = inputs.geo_reference.is_some();
+    let has_no = |profile: &&Profile| !settings.cells.shards.profiles.contains(profile);
+    let profiles: BTreeSet<&Profile> = before.cells.iter().flat_map(|cell| cell.shards.keys()).collect();
+    let shards = profiles.into_iter().filter(has_no).map(|of| format!("{} shards (--profiles)", of.name()));
+    let others = [
+        (before.metric && !settings.inputs.metric && !is_geographic, "metres (--metric)"),
+        (before.geo_reference.is_some() && !is_geographic, "a geo-reference (--geo)"),
+        (before.encoder.text_model.is_some() && !settings.output.text_model, "a text model (--text-model)"),
+    ];
+    others.iter().filter(|(is_lost, _)| *is_lost).map(|(_, what)| (*what).to_owned()).chain(shards).collect()
+}
+
+/// Draws a few views, and counts those that look less like their photo than a plain colour does, and all that tell.
+fn unlike(inputs: &Inputs, scene: &dyn LoadedScene) -> [usize; 2] {
+    let n = inputs.views.len();
+    let mut counts = [0; 2];
+    if inputs.n_drawn == n {
+        return counts;
+    }
+    for view in (0..n.min(N_COMPARED)).map(|i| &inputs.views[i * n / n.min(N_COMPARED)]) {
+        // Photos that cannot be read are told later, each by its name.
+        let Ok(photo) = ingest::load_image(view) else { continue };
+        if let Ok(Some(is_unlike)) = check::is_unlike(photo.into(), scene) {
+            counts[0] += usize::from(is_unlike);
+            counts[1] += 1;
+        }
+    }
+    if 2 * counts[0] > counts[1] {
+        let [n_unlike, of] = counts;
+        tracing::warn!(
+            "{n_unlike} of {of} compared views look less like their photos than a plain colour does: photos, poses and splat do \
+             not belong together; slag-encoder check says why"
+        );
+    }
+    counts
 }
 
 /// Finds and reports kept views that cannot be reused; an unfinished encode is refused later, not replaced.

@@ -160,6 +160,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         n_views_resumed: views.n_resumed,
         lost_views: plan.lost_views.clone(),
         encoder_before: plan.encoder_before.clone(),
+        n_unlike: plan.n_unlike,
         n_views_without_masks: built.n_views_without_masks,
         skipped_views: views.skipped.clone(),
         n_masks: built.n_masks,

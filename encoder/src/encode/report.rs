@@ -129,6 +129,8 @@ pub struct EncodeSummary {
     pub lost_views: Option<LostViews>,
     /// The encoder of the generation before, if it was another: robots need the text model of this one.
     pub(crate) encoder_before: Option<String>,
+    /// Of a few views that were drawn: those that look less like their photo than a plain colour does, and all.
+    pub(crate) n_unlike: [usize; 2],
     /// Views without any mask: no mask file, or no mask that is large enough.
     pub n_views_without_masks: usize,
     pub skipped_views: Vec<SkippedView>,
@@ -158,6 +160,11 @@ pub struct EncodeSummary {
 }
 
 impl EncodeSummary {
+    /// Whether most of the compared views look like their photos.
+    pub(crate) fn fits(&self) -> bool {
+        2 * self.n_unlike[0] <= self.n_unlike[1]
+    }
+
     /// Whether every view was used, and most of the splat.
     pub(crate) fn is_whole(&self) -> bool {
         self.skipped_views.is_empty() && self.n_rejected <= self.n_gaussians
