@@ -183,11 +183,8 @@ impl CellSplit {
 
     /// Reserves the partition: each Gaussian's cell, its index there, and its entry in the cell's list.
     pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
-        memory.reserve(
-            Phase::Always,
-            "the cell of each Gaussian",
-            (n_gaussians * 3 * size_of::<u32>()) as u64,
-        );
+        let len_bytes = (n_gaussians * 3 * size_of::<u32>()) as u64;
+        memory.reserve(Phase::Always, "the cell of each Gaussian", len_bytes);
     }
 }
 

@@ -225,14 +225,8 @@ pub struct Hit {
 
 /// The splat is not the one that the store was encoded from.
 #[derive(Debug, thiserror::Error)]
-pub enum SceneMismatch {
-    #[error("the splat has {found} Gaussians, the store was encoded from one of {expected}; give that splat")]
-    Count { expected: u64, found: usize },
-    #[error(
-        "Gaussian {index} lies at {found} in the splat, at {expected} in the store; give the splat that the store was encoded from"
-    )]
-    Position { index: u32, expected: DVec3, found: DVec3 },
-}
+#[error("{0}")]
+pub struct SceneMismatch(String);
 
 impl Scores {
     /// The `n` best, by cosine, then by index.
@@ -291,7 +285,10 @@ pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Res
     let manifest = reader.manifest();
     let expected = manifest.n_gaussians + manifest.n_rejected;
     if scene.len() as u64 != expected {
-        return Err(SceneMismatch::Count { expected, found: scene.len() });
+        return Err(SceneMismatch(format!(
+            "the splat has {} Gaussians, the store was encoded from one of {expected}; give that splat",
+            scene.len()
+        )));
     }
     let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
     let error = shards.map(|shard| shard.position_error).fold(0.0, f64::max);
@@ -301,7 +298,10 @@ pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Res
         // `NaN <= x` is false: NaN matches nothing.
         let is_same = (found - *expected).abs().max_element() <= 1.01 * error + rounding;
         if !is_same {
-            return Err(SceneMismatch::Position { index: *index, expected: *expected, found });
+            return Err(SceneMismatch(format!(
+                "Gaussian {index} lies at {found} in the splat, at {expected} in the store; give the splat that the store was \
+                 encoded from"
+            )));
         }
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! Finds the mistake that explains why drawings and photos differ.
+//! Finds the mistake that explains why drawings and photos differ, and reports it.
 
 use std::cell::Cell;
 use std::fmt;

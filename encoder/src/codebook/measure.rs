@@ -162,12 +162,8 @@ impl Reference<'_> {
     /// Returns each centroid's largest distance of a member from its decoded form, and the errors of decoded scores.
     /// `residuals`: components to add to the centroids, in the order of the members.
     pub(super) fn compare(&self, residuals: Option<(&Decoder<'_>, &[f32])>) -> (Vec<f32>, ScoreErrors) {
-        let Self {
-            embeddings,
-            members: Members { order, starts: centroid_starts },
-            decoded_centroids,
-            sample,
-        } = self;
+        let Self { embeddings, members, decoded_centroids, sample } = self;
+        let (order, centroid_starts) = (&members.order, &members.starts);
         let dim = embeddings.width;
         let added = residuals
             .map(|(decoder, components)| (decoder.panels(), decoder.lengths(), decoder.m, components));

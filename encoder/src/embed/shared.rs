@@ -43,15 +43,10 @@ struct Shared {
 
 #[derive(Default)]
 struct Queue {
-    waiting: VecDeque<Waiting>,
+    waiting: VecDeque<(Crop, Place)>,
     n_requests: u64,
     /// By the end, or by a batch that panicked and lost its crops.
     is_closed: bool,
-}
-
-struct Waiting {
-    crop: Crop,
-    place: Place,
 }
 
 /// Where a crop's vector goes.
@@ -123,7 +118,7 @@ impl SharedEncoders {
         assert!(!queue.is_closed, "a batch of crops was lost");
         queue.n_requests += 1;
         let request = queue.n_requests;
-        let waiting = |(at, crop)| Waiting { crop, place: Place { request, at, answers: answers.clone() } };
+        let waiting = |(at, crop)| (crop, Place { request, at, answers: answers.clone() });
         queue.waiting.extend(crops.into_iter().enumerate().map(waiting));
         drop(queue);
         drop(answers);
@@ -132,7 +127,7 @@ impl SharedEncoders {
         while n_left > 0 {
             let answer = answered.recv().expect("a batch of crops was lost");
             let (crops, vectors) = answer.inspect_err(|_| {
-                self.shared.queue().waiting.retain(|waiting| waiting.place.request != request);
+                self.shared.queue().waiting.retain(|(_, place)| place.request != request);
             })?;
             n_left -= crops.len();
             parts.insert(crops.start, vectors);
@@ -192,8 +187,8 @@ impl Shared {
             Ok(encoder) => encoder,
             // The encoder cannot be opened: the first crop gets the error, and the others will, too.
             Err(error) => {
-                if let Some(first) = self.queue().waiting.pop_front() {
-                    drop(first.place.answers.send(Err(error.into())));
+                if let Some((_, first)) = self.queue().waiting.pop_front() {
+                    drop(first.answers.send(Err(error.into())));
                 }
                 return;
             }
@@ -201,7 +196,7 @@ impl Shared {
         let (crops, places): (Vec<Crop>, Vec<Place>) = {
             let mut queue = self.queue();
             let n = queue.waiting.len().min(encoder.preferred_batch());
-            let batch = queue.waiting.drain(..n).map(|waiting| (waiting.crop, waiting.place)).unzip();
+            let batch = queue.waiting.drain(..n).unzip();
             if !queue.waiting.is_empty() {
                 self.has_work.notify_one();
             }

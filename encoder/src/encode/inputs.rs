@@ -1,4 +1,4 @@
-//! Scene, views and geo-reference as they were read.
+//! Scene, views and geo-reference as they were read, and the hash that tells two encodes apart.
 
 use std::collections::{BTreeMap, HashSet};
 use std::path::Path;

@@ -1,7 +1,7 @@
 //! The pipeline: photos, poses and a splat in, a published generation of shards out.
 //!
-//! Views are done by an `Executor` (`executor.rs`): this machine, or a fleet. They are independent: a
-//! killed encode resumes after the last finished view, if it is the same encode (`identity.rs`). Later steps read
+//! Views are done by an `Executor` (`views.rs`): this machine, or a fleet. They are independent: a
+//! killed encode resumes after the last finished view, if it is the same encode (`inputs.rs`). Later steps read
 //! contributions in the order of the views' names, so the store's bytes do not depend on threads, on the order of views
 //! or on interruptions.
 

@@ -32,19 +32,12 @@ pub struct CentroidBasis<'a> {
 
 impl<'a> CentroidBasis<'a> {
     pub fn new(dim: usize, basis: Option<Basis<'a>>) -> Self {
-        let basis = basis.map(|basis| {
-            let of_vector = |(v, step): (&[i8], &f32)| {
-                let step = f64::from(*step);
-                v.iter().map(move |v| f64::from(*v) * step).collect::<Vec<f64>>()
-            };
-            (
-                basis.mean,
-                basis.vectors.chunks_exact(dim).zip(basis.steps).flat_map(of_vector).collect::<Vec<f64>>(),
-            )
-        });
-        let mut prepared = Self { dim, basis, factor: Vec::new() };
-        let Some((_, vectors)) = &prepared.basis else { return prepared };
-        let m = prepared.m();
+        let Some(Basis { mean, vectors, steps }) = basis else {
+            return Self { dim, basis: None, factor: Vec::new() };
+        };
+        let step_of = steps.iter().flat_map(|step| std::iter::repeat_n(f64::from(*step), dim));
+        let vectors: Vec<f64> = vectors.iter().zip(step_of).map(|(v, step)| f64::from(*v) * step).collect();
+        let m = vectors.len() / dim;
         let row = |i: usize| &vectors[i * dim..][..dim];
         let mut products = vec![0.0; m * m];
         for i in 0..m {
@@ -53,8 +46,8 @@ impl<'a> CentroidBasis<'a> {
             }
         }
         // Dependent basis vectors get no component.
-        prepared.factor = cholesky(products, m, SmallPivots::Drop(1e-9));
-        prepared
+        let factor = cholesky(products, m, SmallPivots::Drop(1e-9));
+        Self { dim, basis: Some((mean, vectors)), factor }
     }
 
     pub fn m(&self) -> usize {

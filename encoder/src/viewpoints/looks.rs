@@ -1,4 +1,4 @@
-//! A small drawing of a candidate: can it be trusted, and which Gaussians does it show?
+//! Where drawings could be made, and a small drawing of each: can it be trusted, and which Gaussians does it show?
 
 use std::f64::consts::{PI, TAU};
 
