@@ -85,18 +85,11 @@ fn judge(dir: &Path, all: &mut AllCounts) -> Result<()> {
     let robot = middle(&things);
     let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
     for Question { relation, text, truth } in questions(&things, robot) {
-        let answered = ask(&service, &text, robot)?;
-        let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
-        let is_right = |at: &Option<usize>| at.is_some_and(|at| truth.contains(&at));
-        let distinct: BTreeSet<usize> = found.iter().copied().flatten().collect();
-        let counts = Counts {
-            n_questions: 1,
-            n_right: usize::from(found.first().map_or(truth.is_empty(), is_right)),
-            n_answers: found.len(),
-            n_answers_right: found.iter().filter(|at| is_right(at)).count(),
-            n_meant: truth.len(),
-            n_meant_found: distinct.iter().filter(|at| truth.contains(at)).count(),
+        let is_right = match ask(&service, &text, robot)? {
+            Some(best) => thing_of(&things, &best).is_some_and(|at| truth.contains(&at)),
+            None => truth.is_empty(),
         };
+        let counts = Counts { n_questions: 1, n_right: usize::from(is_right) };
         all.entry((relation.text, !truth.is_empty())).or_default().add(counts);
     }
     Ok(())
@@ -151,13 +144,14 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     all
 }
 
-fn ask(service: &Service, text: &str, robot: DVec3) -> Result<Vec<Value>> {
+/// Returns the best answer.
+fn ask(service: &Service, text: &str, robot: DVec3) -> Result<Option<Value>> {
     let body = json!({"texts": [text], "near": [robot.x, robot.y, 0.0], "limit": LIMIT});
     let mut reply = service.post("/v1/query", &body)?;
     match reply["results"][0]["answers"].take() {
-        Value::Array(answers) => Ok(answers),
+        Value::Array(answers) => Ok(answers.into_iter().next()),
         // 422: words unknown to the model.
-        _ if reply["status"] == 422 => Ok(Vec::new()),
+        _ if reply["status"] == 422 => Ok(None),
         _ => Err(anyhow!("{text}: {}", reply["detail"])),
     }
 }
@@ -192,21 +186,12 @@ struct Counts {
     n_questions: usize,
     /// Those whose best answer is right; without a thing that is meant: those without an answer.
     n_right: usize,
-    n_answers: usize,
-    n_answers_right: usize,
-    n_meant: usize,
-    /// Those among the answers.
-    n_meant_found: usize,
 }
 
 impl Counts {
     fn add(&mut self, other: Self) {
         self.n_questions += other.n_questions;
         self.n_right += other.n_right;
-        self.n_answers += other.n_answers;
-        self.n_answers_right += other.n_answers_right;
-        self.n_meant += other.n_meant;
-        self.n_meant_found += other.n_meant_found;
     }
 }
 
@@ -228,17 +213,13 @@ pub(crate) struct RelationsReport {
 impl fmt::Display for RelationsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
-        let columns = ["relation", "answer", "questions", "best right", "precision", "recall"];
-        let mut table = Table::new(columns);
+        let mut table = Table::new(["relation", "answer", "questions", "best right"]);
         for Row { relation, has_answer, counts } in &self.rows {
-            let percent = |n: usize, of: usize| percent(n as u64, of as u64);
             table.row([
                 (*relation).to_owned(),
                 if *has_answer { "some" } else { "none" }.to_owned(),
                 counts.n_questions.to_string(),
-                percent(counts.n_right, counts.n_questions),
-                percent(counts.n_answers_right, counts.n_answers),
-                percent(counts.n_meant_found, counts.n_meant),
+                percent(counts.n_right as u64, counts.n_questions as u64),
             ]);
         }
         write!(f, "{table}")
