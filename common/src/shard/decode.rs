@@ -1,5 +1,7 @@
 //! Decodes embeddings and scores of a shard in float64: the reference that faster code is tested against.
 
+use half::f16;
+
 use super::columns::{Fine, ShardView};
 use super::format::CODEWORDS;
 use crate::objects::{Objects, object_score};
@@ -7,11 +9,7 @@ use crate::objects::{Objects, object_score};
 impl ShardView<'_> {
     /// Writes the vector of a centroid to `out` (`[dim]`); the formula is in the module's documentation.
     pub fn decode_centroid(&self, centroid: usize, out: &mut [f64]) {
-        let m = self.header.n_components as usize;
-        let step = f64::from(self.header.centroid_step);
-        let components: Vec<f64> =
-            self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
-        self.combine(&components, out);
+        self.combine(&self.components_of_centroid(centroid), out);
     }
 
     /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), as accurately as this profile allows.
@@ -29,25 +27,20 @@ impl ShardView<'_> {
     pub fn decode_fine(&self, index: usize, fine: &Fine<'_>, out: &mut [f64]) {
         let m = self.header.n_components as usize;
         let centroid = self.centroid_of(index);
-        let (step, scale) = (f64::from(self.header.centroid_step), f64::from(fine.scales[centroid]));
-        let of_centroid = self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step);
+        let scale = f64::from(fine.scales[centroid]);
+        let mut components = self.components_of_centroid(centroid);
         let residual = fine.values[index * m..][..m].iter().zip(fine.steps);
         let residual = residual.map(|(v, step)| f64::from(*v) * f64::from(*step) * scale);
-        self.combine(&of_centroid.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
+        components.iter_mut().zip(residual).for_each(|(c, r)| *c += r);
+        self.combine(&components, out);
     }
 
     /// Scores every Gaussian with evidence for a query (`[dim]`), from embeddings as decoded by this profile.
     pub fn scores(&self, query: &[f32]) -> Vec<f64> {
-        let dim = self.header.dim as usize;
-        let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
-            vector.zip(query).map(|(v, q)| v * f64::from(*q)).sum()
-        };
         if let Some(exact) = &self.exact {
-            return exact
-                .embeddings
-                .chunks_exact(dim)
-                .map(|e| product(&mut e.iter().map(|v| v.to_f64())))
-                .collect();
+            let embeddings = exact.embeddings.chunks_exact(self.header.dim as usize);
+            let score = |e: &[f16]| e.iter().zip(query).map(|(v, q)| v.to_f64() * f64::from(*q)).sum();
+            return embeddings.map(score).collect();
         }
         let (offset, of_components) = self.components_of_query(query);
         let score = |index| {
@@ -87,13 +80,16 @@ impl ShardView<'_> {
         }
     }
 
+    fn components_of_centroid(&self, centroid: usize) -> Vec<f64> {
+        let m = self.header.n_components as usize;
+        let step = f64::from(self.header.centroid_step);
+        self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step).collect()
+    }
+
     /// Returns the components of a Gaussian with evidence: centroid plus residual.
     fn components(&self, index: usize) -> Vec<f64> {
-        let m = self.header.n_components as usize;
         let centroid = self.centroid_of(index);
-        let step = f64::from(self.header.centroid_step);
-        let mut components: Vec<f64> =
-            self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
+        let mut components = self.components_of_centroid(centroid);
         if let Some(residuals) = &self.residuals {
             let scale = f64::from(residuals.residual_scales[centroid]);
             for subspace in 0..residuals.subspace_starts.len() - 1 {

@@ -41,14 +41,16 @@ pub(crate) struct RobotArgs {
     /// Numbers of results.
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [1_000, 10_000, 50_000, 100_000], value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
     limits: Vec<u64>,
-    /// What to time: profiles of slag-edge, and engines of slag-bench-rivals. A graph of millions takes hours to build.
+    /// What to time: profiles of slag-edge, and engines of slag-bench-rivals. NAME=GAUSSIANS leaves an engine out
+    /// at larger sizes: a graph of millions takes hours to build.
     #[arg(
         long,
-        value_name = "NAME,...",
+        value_name = "NAME[=MOST],...",
         value_delimiter = ',',
-        default_value = "compact,balanced,dense,qdrant-scan,qdrant-scan-int8,qdrant-hnsw,qdrant-hnsw-int8,qdrant-hnsw-pq"
+        default_value = "compact,balanced,dense,qdrant-scan,qdrant-scan-int8,qdrant-hnsw,qdrant-hnsw-int8,qdrant-hnsw-pq",
+        value_parser = engine
     )]
-    engines: Vec<String>,
+    engines: Vec<(String, u64)>,
     /// Timed queries of each number of results.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
     runs: u32,
@@ -57,6 +59,17 @@ pub(crate) struct RobotArgs {
     rivals: Option<PathBuf>,
     #[command(flatten)]
     models: ModelArgs,
+}
+
+/// An engine's name and the most Gaussians at which it is measured.
+fn engine(text: &str) -> Result<(String, u64), String> {
+    let (name, most) = text.split_once('=').map_or((text, Ok(u64::MAX)), |(name, most)| (name, most.parse()));
+    let is_name =
+        !name.is_empty() && name.chars().all(|c| c.is_ascii_lowercase() || c == '-' || c.is_ascii_digit());
+    match most {
+        Ok(most) if is_name => Ok((name.to_owned(), most)),
+        _ => Err(format!("{text:?} is not NAME or NAME=GAUSSIANS, like qdrant-hnsw=1000000")),
+    }
 }
 
 /// The profile whose shards `slag-edge` queries; `None` for engines of `edge/benches/rivals`.
@@ -131,11 +144,15 @@ pub(crate) fn run(args: &RobotArgs, progress: &dyn Progress) -> Result<RobotRepo
     let free = free_memory_bytes();
     for size in &args.gaussians {
         let mut scene = Scene::new(args, *size);
-        for engine in &args.engines {
+        for (engine, most) in &args.engines {
             let path = args.out.join(format!("figures/{engine}-{size}-{}.json", args.dim));
             if path.is_file() {
                 let malformed = || format!("{}: delete the file to measure again", path.display());
                 report.figures.push(serde_json::from_slice(&fs_err::read(&path)?).with_context(malformed)?);
+            } else if size > most {
+                report
+                    .not_run
+                    .push(format!("{engine} at {} M: asked for up to {most} Gaussians", *size as f64 / 1e6));
             } else if let Some(reason) = reason_against(engine, args, free, *size) {
                 report.not_run.push(format!("{engine} at {} M: {reason}", *size as f64 / 1e6));
             } else {
@@ -174,7 +191,7 @@ impl<'a> Scene<'a> {
         }
         remove(dir)?;
         let mut profiles: Vec<Profile> =
-            args.engines.iter().filter_map(|engine| profile_of(engine)).collect();
+            args.engines.iter().filter_map(|(engine, _)| profile_of(engine)).collect();
         let has_exact = profiles.contains(&Profile::Exact);
         if args.rivals.is_some() && !has_exact {
             profiles.push(Profile::Exact);
@@ -397,7 +414,7 @@ mod tests {
         let dir = tempfile::tempdir().expect("a folder");
         let out = dir.path().to_str().expect("UTF-8");
         let line = ["x", "--out", out, "--gaussians", "1000,2000", "--limits", "10", "--dim", "16"];
-        let line = line.into_iter().chain(["--engines", "dense", "--models", "colours"]);
+        let line = line.into_iter().chain(["--engines", "dense,qdrant-scan=1000", "--models", "colours"]);
         let args = Line::parse_from(line).args;
         let few = RobotArgs { rivals: Some(PathBuf::new()), ..Line::parse_from(["x", "--out", out]).args };
         assert!(reason_against("dense", &few, Some(10), 1000).is_some_and(|reason| reason.contains("needs")));
@@ -412,6 +429,7 @@ mod tests {
         for line in [
             "| dense (l) | 0.001 | 12.30 (0.50, 0.900) | - | 0.05 | 61 |",
             "- not run: dense at 0.002 M: no --rivals program is given",
+            "- not run: qdrant-scan at 0.002 M: asked for up to 1000 Gaussians",
             "| 100,000 | 0.52 | 0.74 | 1.36 | 2.37 |",
         ] {
             assert!(lines.iter().any(|found| found == line), "{line}\n{page}");

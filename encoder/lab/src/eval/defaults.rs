@@ -9,11 +9,10 @@ use slag_common::shard::Profile;
 use slag_encoder::encode::Preset;
 use slag_encoder::progress::Progress;
 
-use super::instances::InstanceReport;
 use super::judge::{EvalKind, EvalReport, JudgeSettings, judge};
 use super::run::{MaskSource, Runner, ScenesArgs, truth_of};
 use crate::scenes::SceneFiles;
-use crate::table::{Table, figure, percent};
+use crate::table::{Table, figure};
 
 /// Encodes of a scene: given and automatic masks, the plain average and the default.
 const N_ENCODES: usize = 4;
@@ -75,27 +74,15 @@ pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<Defaults
 
 impl fmt::Display for DefaultsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let columns = ["scene", "masks", "method", "by", "mIoU", "AP", "AUC"];
-        let of_things = [
-            "found at IoU 0.25 and 0.5",
-            "objects that are two things",
-            "things split",
-            "Gaussians in objects",
-        ];
-        let mut table = Table::new(columns.into_iter().chain(of_things));
+        let columns = ["scene", "masks", "method", "by", "mIoU", "AP", "AUC", "found at IoU 0.5"];
+        let mut table = Table::new(columns);
         for row in &self.rows {
             let mut cells = vec![row.scene.clone(), row.masks.name().to_owned()];
             let report = &row.report;
             cells.extend([row.method.to_owned(), report.kind.to_string()]);
             cells
                 .extend([report.miou, report.mean_average_precision, report.mean_area_under_roc].map(figure));
-            if let Some(found) = &report.instances {
-                let InstanceReport { any, n_merged_objects, n_objects, n_in_objects, n_split_things, .. } =
-                    found;
-                cells.push(any.to_string());
-                cells.extend([format!("{n_merged_objects} of {n_objects}"), n_split_things.to_string()]);
-                cells.push(percent(n_in_objects[0] as u64, n_in_objects[1] as u64));
-            }
+            cells.extend(report.instances.map(|found| found.to_string()));
             table.row(cells);
         }
         write!(f, "{table}")

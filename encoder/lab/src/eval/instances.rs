@@ -4,107 +4,46 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::Serialize;
-use slag_encoder::query::PublishedObjects;
-
-use super::truth::Truth;
-use crate::table::percent;
 use slag_encoder::objects::NONE;
 
-/// Least overlap, as a share of the object or the thing, that counts as a piece.
-const PIECE: f64 = 0.25;
+use super::truth::Truth;
 
+/// Things, and those found by any object, whatever its word: the quality of the segmentation alone.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Recall {
     pub(crate) n: usize,
-    /// Things found with an intersection over union of at least 0.25.
-    pub(crate) n_at_25: usize,
-    /// Things found with at least 0.5.
+    /// With an intersection over union of at least 0.5.
     pub(crate) n_at_50: usize,
-}
-
-impl Recall {
-    fn count(&mut self, iou: f64) {
-        self.n += 1;
-        self.n_at_25 += usize::from(iou >= 0.25);
-        self.n_at_50 += usize::from(iou >= 0.5);
-    }
 }
 
 impl fmt::Display for Recall {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} and {} of {}", self.n_at_25, self.n_at_50, self.n)
+        write!(f, "{} of {}", self.n_at_50, self.n)
     }
-}
-
-/// Instance recall of objects, over sets of Gaussians.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub(crate) struct InstanceReport {
-    pub(crate) n_objects: usize,
-    /// Gaussians that belong to one, and all: the others' superpoints abstain.
-    pub(crate) n_in_objects: [usize; 2],
-    /// Objects that are two things (under-segmentation): two labels, floors and walls included, have a quarter of
-    /// it each.
-    pub(crate) n_merged_objects: usize,
-    /// Things that are two objects (over-segmentation): two objects have a quarter of it each.
-    pub(crate) n_split_things: usize,
-    /// Recall by any object, whatever its word: the quality of the segmentation alone.
-    pub(crate) any: Recall,
-}
-
-impl fmt::Display for InstanceReport {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { n_objects, n_in_objects, n_merged_objects, n_split_things, any } = self;
-        let share = percent(n_in_objects[0] as u64, n_in_objects[1] as u64);
-        writeln!(
-            f,
-            "{n_objects} objects of {share} of all Gaussians; things found at IoU 0.25 and 0.5: {any}"
-        )?;
-        writeln!(
-            f,
-            "  objects that are two things: {n_merged_objects}; things that are two objects: {n_split_things}"
-        )
-    }
-}
-
-pub(super) fn report(truth: &Truth, objects: &PublishedObjects) -> InstanceReport {
-    of_objects(truth, &objects.object_of, objects.ids.len())
 }
 
 /// `object_of`: the object of each Gaussian.
-fn of_objects(truth: &Truth, object_of: &[u32], n_objects: usize) -> InstanceReport {
-    let mut n_of_object = vec![0u64; n_objects];
+pub(super) fn recall(truth: &Truth, object_of: &[u32]) -> Recall {
+    let mut n_of_object: BTreeMap<u32, u64> = BTreeMap::new();
     let mut n_of_thing: BTreeMap<u16, u64> = BTreeMap::new();
     let mut n_of_both: BTreeMap<(u16, u32), u64> = BTreeMap::new();
     for (object, thing) in object_of.iter().zip(&truth.id_of_gaussian) {
         *n_of_thing.entry(*thing).or_default() += 1;
         if *object != NONE {
-            n_of_object[*object as usize] += 1;
+            *n_of_object.entry(*object).or_default() += 1;
             *n_of_both.entry((*thing, *object)).or_default() += 1;
         }
     }
-    let best_iou = |thing: u16| {
-        let of_thing = n_of_both.range((thing, 0)..=(thing, u32::MAX));
-        let iou = |((_, object), both): (&(u16, u32), &u64)| {
-            *both as f64 / (n_of_object[*object as usize] + n_of_thing[&thing] - both) as f64
-        };
-        of_thing.map(iou).fold(0.0, f64::max)
+    let is_found = |thing: &u16| {
+        let mut of_thing = n_of_both.range((*thing, 0)..=(*thing, u32::MAX));
+        of_thing.any(|((_, object), both)| 2 * both >= n_of_object[object] + n_of_thing[thing] - both)
     };
-    let mut n_labels_of_object = vec![0usize; n_objects];
-    let mut n_objects_of_thing: BTreeMap<u16, usize> = BTreeMap::new();
-    for ((label, object), both) in &n_of_both {
-        let is_piece = |of: u64| *both as f64 >= PIECE * of as f64;
-        n_labels_of_object[*object as usize] += usize::from(is_piece(n_of_object[*object as usize]));
-        *n_objects_of_thing.entry(*label).or_default() += usize::from(is_piece(n_of_thing[label]));
-    }
-    let is_split = |id: &u16| n_objects_of_thing.get(id).is_some_and(|n| *n > 1);
-    let n_split_things = truth.things.iter().filter(|thing| is_split(&thing.id)).count();
-    let n_merged_objects = n_labels_of_object.iter().filter(|n| **n > 1).count();
-    let mut any = Recall::default();
     // Things without Gaussians cannot be found.
     let things = truth.things.iter().map(|thing| thing.id).filter(|id| n_of_thing.contains_key(id));
-    things.for_each(|thing| any.count(best_iou(thing)));
-    let n_in_objects = [object_of.iter().filter(|object| **object != NONE).count(), object_of.len()];
-    InstanceReport { n_objects, n_in_objects, n_merged_objects, n_split_things, any }
+    things.fold(Recall::default(), |Recall { n, n_at_50 }, thing| Recall {
+        n: n + 1,
+        n_at_50: n_at_50 + usize::from(is_found(&thing)),
+    })
 }
 
 #[cfg(test)]
@@ -122,11 +61,8 @@ mod tests {
             background: vec![thing(1, "wall")],
             id_of_gaussian: vec![7, 7, 7, 7, 8, 8, 8, 8, 1, 1],
         };
-        // IoU: 3/4; 1/4 with object 1, 2/6 with object 2. Object 2 is half thing and half wall; thing 8 is a quarter
-        // of object 1 and half of object 2.
-        let found = of_objects(&truth, &[0, 0, 0, NONE, 1, 2, 2, NONE, 2, 2], 3);
-        assert_eq!((found.n_objects, found.n_merged_objects, found.n_split_things), (3, 1, 1));
-        assert_eq!(found.n_in_objects, [8, 10]);
-        assert_eq!(found.any, Recall { n: 2, n_at_25: 2, n_at_50: 1 });
+        // IoU: 3/4; 1/4 with object 1, 2/6 with object 2.
+        let found = recall(&truth, &[0, 0, 0, NONE, 1, 2, 2, NONE, 2, 2]);
+        assert_eq!(found, Recall { n: 2, n_at_50: 1 });
     }
 }

@@ -12,7 +12,7 @@ use slag_encoder::query::{self, PublishedObjects};
 use slag_encoder::store::StoreReader;
 use slag_models::TextEncoder;
 
-use super::instances::{self, InstanceReport};
+use super::instances::{Recall, recall};
 use super::metrics::{Confusion, area_under_roc, average_precision, mean};
 use super::truth::Truth;
 use crate::table::{Table, figure};
@@ -79,8 +79,8 @@ pub(crate) struct EvalReport {
     /// Profile of the scored shards; absent for the full field.
     profile: Option<Profile>,
     pub(crate) kind: EvalKind,
-    /// Only where objects were scored.
-    pub(crate) instances: Option<InstanceReport>,
+    /// Things that objects find; only where objects were scored.
+    pub(crate) instances: Option<Recall>,
     words: Vec<WordReport>,
     /// Means over the words, as the columns of their names.
     pub(crate) miou: Option<f64>,
@@ -117,7 +117,7 @@ pub(crate) fn judge(
         encoder: reader.manifest().encoder.name.clone(),
         profile: settings.profile,
         kind: if objects.is_some() { EvalKind::Objects } else { EvalKind::Gaussians },
-        instances: objects.as_ref().map(|objects| instances::report(truth, objects)),
+        instances: objects.as_ref().map(|objects| recall(truth, &objects.object_of)),
         miou: mean(words.iter().map(|w| w.iou)),
         macc: mean(words.iter().map(|w| w.accuracy)),
         mean_average_precision: mean(words.iter().map(|w| w.average_precision)),
@@ -251,7 +251,7 @@ impl fmt::Display for EvalReport {
         let [miou, macc, ap, auc] = means.map(figure);
         writeln!(f, "{} words: mIoU {miou}, mAcc {macc}, AP {ap}, AUC {auc}", self.words.len())?;
         if let Some(found) = &self.instances {
-            write!(f, "{found}")?;
+            writeln!(f, "things found at IoU 0.5: {found}")?;
         }
         if !self.unknown_words.is_empty() {
             let words: Vec<&str> = self.unknown_words.keys().map(String::as_str).collect();

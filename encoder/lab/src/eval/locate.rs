@@ -63,8 +63,6 @@ struct Located {
     name: String,
     gaussians: Gaussians,
     map: Map,
-    len_bytes: u64,
-    map_secs: f64,
     queries: Vec<View>,
     /// What queries show instead of their photos.
     drawn: Option<Gaussians>,
@@ -99,7 +97,6 @@ struct Figures {
     n: usize,
     n_foreign: usize,
     within_25cm_5deg: Option<f64>,
-    within_1m_10deg: Option<f64>,
     lost: Option<f64>,
     /// Found, but further away than 1 m or 10 degrees.
     wrong: Option<f64>,
@@ -107,9 +104,6 @@ struct Figures {
     /// Median error of those that were found.
     median_m: Option<f64>,
     median_secs: Option<f64>,
-    bytes_per_million: Option<f64>,
-    #[serde(skip)]
-    map_secs: f64,
 }
 
 pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateReport> {
@@ -133,13 +127,13 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         let others: Vec<_> = others.iter().step_by(others.len().div_ceil(MAX_FOREIGN).max(1)).collect();
         let foreign =
             others.par_iter().map(|(other, view)| attempt(*other, view)).collect::<Result<Vec<_>>>()?;
-        of_scenes.push(Figures::of(&scene.name, &[scene], &tries, &foreign));
+        of_scenes.push(Figures::of(&scene.name, &tries, &foreign));
         all_tries.extend(tries);
         all_foreign.extend(foreign);
         progress.advance(1);
     }
     progress.end();
-    let all = Figures::of("all", &scenes.iter().collect::<Vec<_>>(), &all_tries, &all_foreign);
+    let all = Figures::of("all", &all_tries, &all_foreign);
     Ok(LocateReport { all, scenes: of_scenes })
 }
 
@@ -148,7 +142,6 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     let views = poses::read(&files.poses, files.images.as_deref())?.views;
     // The last photo of each group.
     let is_query = |at: usize| at % HELD_OUT == HELD_OUT - 1;
-    let start = Instant::now();
     let loaded = CpuRasterizer.load(&gaussians)?;
     let mapping = views.iter().enumerate().filter(|(at, _)| !is_query(*at));
     let mapping: Vec<MappingView> = mapping
@@ -173,8 +166,6 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     Ok(Located {
         name: files.name.clone(),
         map: Map::new(built.view().map(|view| view.iter().collect()).unwrap_or_default()),
-        len_bytes: built.len_bytes(),
-        map_secs: start.elapsed().as_secs_f64(),
         gaussians: on_board(&gaussians),
         queries,
         drawn,
@@ -247,7 +238,7 @@ fn attempt(scene: &Located, query: &Query, renderer: &dyn Renderer) -> Try {
 }
 
 impl Figures {
-    fn of(name: &str, scenes: &[&Located], tries: &[Try], foreign: &[Try]) -> Self {
+    fn of(name: &str, tries: &[Try], foreign: &[Try]) -> Self {
         let share = |n: usize, of: usize| (of > 0).then(|| n as f64 / of as f64);
         let of_tries =
             |is: &dyn Fn(&Try) -> bool| share(tries.iter().filter(|one| is(one)).count(), tries.len());
@@ -255,37 +246,29 @@ impl Figures {
             values.sort_by(f64::total_cmp);
             values.get(values.len() / 2).copied()
         };
-        let n_gaussians: usize = scenes.iter().map(|scene| scene.gaussians.len()).sum();
-        let len_bytes: u64 = scenes.iter().map(|scene| scene.len_bytes).sum();
         Self {
             name: name.to_owned(),
             n: tries.len(),
             n_foreign: foreign.len(),
             within_25cm_5deg: of_tries(&|one| one.is_within(0.25, 5.0)),
-            within_1m_10deg: of_tries(&|one| one.is_within(1.0, 10.0)),
             lost: of_tries(&|one| one.found.is_none()),
             wrong: of_tries(&|one| one.found.is_some() && !one.is_within(1.0, 10.0)),
             foreign_accepted: share(foreign.iter().filter(|one| one.found.is_some()).count(), foreign.len()),
             median_m: median(tries.iter().filter_map(|one| Some(one.found?[0])).collect()),
             median_secs: median(tries.iter().map(|one| one.secs).collect()),
-            bytes_per_million: (n_gaussians > 0).then(|| len_bytes as f64 * 1e6 / n_gaussians as f64),
-            map_secs: scenes.iter().map(|scene| scene.map_secs).sum(),
         }
     }
 }
 
 impl fmt::Display for LocateReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let columns = "scene|n|0.25 m, 5 deg|1 m, 10 deg|lost|wrong|median m|median s|foreign|accepted";
-        let mut table = Table::new(columns.split('|').chain(["bytes a million", "map s"]));
+        let columns = "scene|n|0.25 m, 5 deg|lost|wrong|median m|median s|foreign|accepted";
+        let mut table = Table::new(columns.split('|'));
         for of in self.scenes.iter().chain([&self.all]) {
-            let shares =
-                [of.within_25cm_5deg, of.within_1m_10deg, of.lost, of.wrong, of.median_m, of.median_secs];
+            let shares = [of.within_25cm_5deg, of.lost, of.wrong, of.median_m, of.median_secs];
             let mut row = vec![of.name.clone(), of.n.to_string()];
             row.extend(shares.map(figure));
             row.extend([of.n_foreign.to_string(), figure(of.foreign_accepted)]);
-            row.push(of.bytes_per_million.map_or("-".into(), |b| format!("{b:.0}")));
-            row.push(format!("{:.1}", of.map_secs));
             table.row(row);
         }
         write!(f, "{table}")

@@ -100,7 +100,7 @@ fn figures(
         judge(&encoded.reader, &truth, text, &settings)
     };
     let (of_gaussians, of_objects) = (by(EvalKind::Gaussians)?, by(EvalKind::Objects)?);
-    let any = of_objects.instances.map(|instances| instances.any);
+    let any = of_objects.instances;
     let n_views = encoded.summary.n_views;
     let figures = Figures {
         n_views: Some(n_views as f64),
