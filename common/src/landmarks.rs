@@ -113,6 +113,10 @@ impl BuiltLandmarks {
     pub fn view(&self) -> Option<Landmarks<'_>> {
         (!self.records.is_empty()).then_some(Landmarks { header: &self.header, records: &self.records })
     }
+
+    pub fn len_bytes(&self) -> u64 {
+        (size_of::<LandmarksHeader>() + size_of_val(&self.records[..])) as u64
+    }
 }
 
 /// Checks the landmarks of a shard, if it has any.

@@ -219,10 +219,6 @@ impl Axes {
         Self { dim, words, gate: Gate::default(), n_encoded: Arc::default() }
     }
 
-    pub(crate) fn n_encoded(&self) -> Arc<AtomicUsize> {
-        Arc::clone(&self.n_encoded)
-    }
-
     pub fn info(dim: usize) -> EncoderInfo {
         let id = TestShard::new(Vec::new()).encoder_id;
         EncoderInfo { name: "axes".into(), id, dim: dim as u32, execution_provider: "none" }
@@ -264,7 +260,7 @@ impl TextEncoder for Axes {
 /// Returns a service over [`Axes`] and the number of texts that it encoded.
 pub fn axes_service(dim: usize, gate: Gate) -> (TextService, Arc<AtomicUsize>) {
     let axes = Axes { gate, ..Axes::new(dim) };
-    let n_encoded = axes.n_encoded();
+    let n_encoded = Arc::clone(&axes.n_encoded);
     (TextService::start(Axes::info(dim), Box::new(axes)).expect("a thread"), n_encoded)
 }
 

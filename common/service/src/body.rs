@@ -27,7 +27,7 @@ const DRAIN_TIME: Duration = Duration::from_secs(1);
 
 type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
-#[derive(Clone, Copy, Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 #[error("the body was not complete {} s after the head", after.as_secs_f64())]
 struct TooSlow {
     after: Duration,
@@ -157,19 +157,17 @@ pub(crate) async fn read(
     }
     let mut whole = Held { bytes: Vec::new(), room: None };
     while let Some(frame) = poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await {
-        let frame = frame.map_err(|error| match too_slow(&error) {
-            Some(slow) => ends(Problem::new(
-                StatusCode::REQUEST_TIMEOUT,
-                "body-timeout",
-                "Request timeout",
-                slow.to_string(),
-            )),
-            None => ends(Problem::new(
-                StatusCode::BAD_REQUEST,
-                "body-incomplete",
-                "Body incomplete",
-                format!("the request's body broke off: {error}"),
-            )),
+        let frame = frame.map_err(|error| {
+            ends(match too_slow(&error) {
+                Some(slow) => {
+                    let status = StatusCode::REQUEST_TIMEOUT;
+                    Problem::new(status, "body-timeout", "Request timeout", slow.to_string())
+                }
+                None => {
+                    let detail = format!("the request's body broke off: {error}");
+                    Problem::new(StatusCode::BAD_REQUEST, "body-incomplete", "Body incomplete", detail)
+                }
+            })
         })?;
         let Ok(bytes) = frame.into_data() else { continue };
         let len = whole.bytes.len() + bytes.len();
@@ -185,15 +183,9 @@ pub(crate) async fn read(
     Ok(Bytes::from_owner(whole))
 }
 
-fn too_slow(error: &axum::Error) -> Option<TooSlow> {
-    let mut at: Option<&(dyn std::error::Error + 'static)> = Some(error);
-    while let Some(error) = at {
-        if let Some(slow) = error.downcast_ref::<TooSlow>() {
-            return Some(*slow);
-        }
-        at = error.source();
-    }
-    None
+fn too_slow(error: &axum::Error) -> Option<&TooSlow> {
+    let first: &(dyn std::error::Error + 'static) = error;
+    std::iter::successors(Some(first), |error| error.source()).find_map(|error| error.downcast_ref())
 }
 
 /// Refuses a Content-Type outside `media_types`; any page may post forms and plain text without a preflight.

@@ -16,30 +16,24 @@ const UNIX: &str = "unix:";
 /// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a new connection. With
 /// TLS, any answer to a non-handshake suffices. Does not return while the service is silent.
 pub async fn answers(url: &str) -> bool {
-    let asked = match (url.strip_prefix(UNIX), url.split_once("://")) {
-        (Some(path), _) => match tokio::net::UnixStream::connect(path).await {
-            Ok(stream) => ask_for_health(stream).await,
-            Err(error) => Err(error),
-        },
-        (_, Some((_, address))) => {
-            // A service on all addresses is reached through the loopback.
-            let address = address.replace("0.0.0.0:", "127.0.0.1:").replace("[::]:", "[::1]:");
-            match tokio::net::TcpStream::connect(address).await {
-                Ok(stream) => ask_for_health(stream).await,
-                Err(error) => Err(error),
-            }
-        }
-        _ => return false,
-    };
-    asked.is_ok_and(|answer| match url.starts_with("https") {
+    ask_for_health(url).await.is_ok_and(|answer| match url.starts_with("https") {
         true => !answer.is_empty(),
         false => answer.starts_with(b"HTTP/1.1 200"),
     })
 }
 
-async fn ask_for_health(mut stream: impl Stream) -> io::Result<Vec<u8>> {
+async fn ask_for_health(url: &str) -> io::Result<Vec<u8>> {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
+    let mut stream: Box<dyn Stream> = match url.strip_prefix(UNIX) {
+        Some(path) => Box::new(tokio::net::UnixStream::connect(path).await?),
+        None => {
+            let (_, address) = url.split_once("://").unwrap_or_default();
+            // A service on all addresses is reached through the loopback.
+            let address = address.replace("0.0.0.0:", "127.0.0.1:").replace("[::]:", "[::1]:");
+            Box::new(tokio::net::TcpStream::connect(address).await?)
+        }
+    };
     stream.write_all(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n").await?;
     let mut answer = Vec::new();
     stream.take(1 << 12).read_to_end(&mut answer).await?;

@@ -221,13 +221,12 @@ async fn whole_body(
     next: Next,
 ) -> Response {
     let (head, body) = request.into_parts();
-    let is_taken =
-        body::check_type(&head.headers, media_types).and_then(|()| body::check_encoding(&head.headers));
-    let checked = match is_taken {
-        Ok(()) => body::read(body, max_bytes, &LONG_BODIES).await,
-        Err(problem) => Err(problem),
+    let checked = async {
+        body::check_type(&head.headers, media_types)?;
+        body::check_encoding(&head.headers)?;
+        body::read(body, max_bytes, &LONG_BODIES).await
     };
-    match checked {
+    match checked.await {
         Ok(bytes) => next.run(Request::from_parts(head, bytes.into())).await,
         Err(problem) => problem.into_response(),
     }

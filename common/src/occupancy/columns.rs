@@ -126,6 +126,13 @@ impl<'a> Occupancy<'a> {
             Some(BlockRun { blocks: run.start..run.start + run.len(), kind, masks: of_run })
         })
     }
+
+    pub fn block_at(&self, index: u32) -> [i32; 3] {
+        let [_, n_y, n_z] = self.header.n_blocks;
+        let (x, y, z) = (index / n_z / n_y, index / n_z % n_y, index % n_z);
+        let first = self.header.first_block;
+        [first[0] + x as i32, first[1] + y as i32, first[2] + z as i32]
+    }
 }
 
 /// Most blocks of a shard's box: readers count them in 32 bits, and a writer keeps within 512 along each axis.

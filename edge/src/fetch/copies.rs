@@ -41,11 +41,6 @@ pub struct Copies {
 }
 
 impl Copies {
-    /// Names the copies, without reading or creating anything.
-    pub fn new(dir: PathBuf) -> Self {
-        Self { dir }
-    }
-
     pub fn paths(&self) -> [PathBuf; 2] {
         [0, 1].map(|index| self.path(index))
     }
@@ -161,7 +156,7 @@ mod tests {
 
     fn written(contents: &[&str]) -> (tempfile::TempDir, Copies) {
         let dir = tempfile::tempdir().expect("a folder");
-        let copies = Copies::new(dir.path().to_owned());
+        let copies = Copies { dir: dir.path().to_owned() };
         let mut present = None;
         for content in contents {
             let content = content.as_bytes().to_vec();

@@ -385,8 +385,7 @@ mod tests {
         assert_eq!(follower.decide(at, x(9.0)), Decision::NotBefore(at + secs(10)));
         follower.fetched(at, DVec3::X * 9.0);
         assert_eq!(follower.decide(at, x(9.0)), Decision::Rest(Some(at + secs(100))));
-        let never = Follower::new(FollowSettings { refresh: None, ..settings() });
-        let mut never = never;
+        let mut never = Follower::new(FollowSettings { refresh: None, ..settings() });
         never.fetched(secs(0), DVec3::ZERO);
         assert_eq!(never.decide(secs(1 << 40), x(0.0)), Decision::Rest(None));
     }

@@ -130,9 +130,7 @@ impl Position {
             }
         }
     }
-}
 
-impl Position {
     fn check(&self) -> Result<(), PlanError> {
         let world = |name, value| (name, value, MAX_COORDINATE, "within ±1e9");
         let numbers = match *self {

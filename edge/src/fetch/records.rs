@@ -164,7 +164,7 @@ pub(super) fn stamp(cache: &EdgeCache) -> [Option<Stat>; 2] {
 }
 
 fn copies_of(cache: &EdgeCache) -> Copies {
-    Copies::new(cache.dir().join("trust"))
+    Copies { dir: cache.dir().join("trust") }
 }
 
 /// Reads the newest record, if there is one; the inner error is damage.

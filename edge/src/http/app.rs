@@ -33,7 +33,6 @@ pub struct App {
     loading: Mutex<()>,
     /// Unreadable shards already handed to the follower.
     asked: Mutex<BTreeSet<Hash32>>,
-    n_reload_attempts: watch::Sender<u64>,
 }
 
 impl App {
@@ -55,7 +54,6 @@ impl App {
             following,
             loading: Mutex::default(),
             asked: Mutex::default(),
-            n_reload_attempts: watch::Sender::new(0),
         };
         app.ask_for_unreadable();
         Arc::new(app)
@@ -64,11 +62,6 @@ impl App {
     /// Returns the robot's last position, if it is followed and the scene can place it.
     pub(super) fn last_position(&self, manifest: &Manifest) -> Option<DVec3> {
         self.following.as_ref()?.status().position?.in_world(manifest).ok()
-    }
-
-    #[cfg(test)]
-    pub(crate) fn reload_attempts(&self) -> watch::Receiver<u64> {
-        self.n_reload_attempts.subscribe()
     }
 
     /// Loads another generation if the cache changed (one `stat` call): in the background while one on board answers,
@@ -104,17 +97,6 @@ impl App {
     }
 
     fn reload(&self) {
-        /// Counts the attempt even if it panics.
-        struct Attempt<'a>(&'a App);
-        impl Drop for Attempt<'_> {
-            fn drop(&mut self) {
-                if std::thread::panicking() {
-                    self.0.metrics.reload_failures.fetch_add(1, Ordering::Relaxed);
-                }
-                self.0.n_reload_attempts.send_modify(|n| *n += 1);
-            }
-        }
-        let _attempt = Attempt(self);
         let counter = match self.engine.reload() {
             Ok(()) => {
                 self.ask_for_unreadable();

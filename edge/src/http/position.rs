@@ -13,8 +13,7 @@ use slag_service::replies::{As, Described, Reply};
 
 use super::app::App;
 use super::problem::{follower_failed, not_following};
-use crate::fetch::NotAPosition;
-use crate::fetch::Position;
+use crate::fetch::{NotAPosition, Position};
 use crate::query::RequestError;
 
 /// Longest body; a position needs a tenth.

@@ -86,10 +86,7 @@ fn unreadable(error: &serde_json::Error) -> Problem {
 
 async fn answer(app: &Arc<App>, ask: Result<Ask, Problem>) -> Result<Response, Problem> {
     let started = Instant::now();
-    let answer = match ask {
-        Ok(ask) => answer_within_limits(app, ask).await,
-        Err(problem) => Err(problem),
-    };
+    let answer = async { answer_within_limits(app, ask?).await }.await;
     app.metrics.query_times.observe(started.elapsed());
     answer
 }

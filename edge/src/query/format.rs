@@ -55,7 +55,6 @@ impl Reply {
 
 /// A piece ends with the first answer past this size.
 const JSON_PIECE_BYTES: usize = 64 << 10;
-const ANSWER_BYTES: usize = 1 << 10;
 
 struct JsonPieces {
     reply: Arc<Reply>,
@@ -69,15 +68,10 @@ impl Iterator for JsonPieces {
     type Item = io::Result<Vec<u8>>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        let mut piece = Vec::with_capacity(JSON_PIECE_BYTES + ANSWER_BYTES);
-        match self.fill(&mut piece) {
-            Ok(()) if piece.is_empty() => None,
-            Ok(()) => Some(Ok(piece)),
-            Err(error) => {
-                self.is_closed = true;
-                Some(Err(error))
-            }
-        }
+        let mut piece = Vec::new();
+        let filled = self.fill(&mut piece);
+        self.is_closed |= filled.is_err();
+        (filled.is_err() || !piece.is_empty()).then(|| filled.map(|()| piece))
     }
 }
 

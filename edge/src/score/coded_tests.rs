@@ -1,7 +1,7 @@
 //! Shards with bases and residual codes.
 
 use slag_common::container::AlignedBytes;
-use slag_common::shard::{MAX_SUBSPACES, ShardLayout};
+use slag_common::shard::{Basis, MAX_SUBSPACES, Residuals, ShardLayout, ShardView};
 
 use super::cell::UNDECIDED;
 use super::tests::{random_question, score_in_f64, views};
@@ -26,11 +26,7 @@ const SHAPES: [(usize, usize, bool, usize); 10] = [
     (515, 3, true, 2),
 ];
 
-fn shards(random: &mut Random, shape: (usize, usize, bool, usize)) -> Vec<BuiltShard> {
-    shards_of(random, shape, false)
-}
-
-fn shards_of(
+fn shards(
     random: &mut Random,
     (dim, n_components, has_basis, n_subspaces): (usize, usize, bool, usize),
     is_exact: bool,
@@ -75,7 +71,7 @@ fn scores_are_within_the_stated_error() {
     let mut random = Random::new(21);
     let mut largest_share = 0.0f64;
     for shape in SHAPES {
-        let built = shards(&mut random, shape);
+        let built = shards(&mut random, shape, false);
         let views = views(&built);
         for n_negatives in [0, 3] {
             let question = random_question(&mut random, shape.0, n_negatives);
@@ -123,7 +119,7 @@ fn answers_are_those_of_brute_force() {
     let mut random = Random::new(22);
     let (mut n_scanned, mut n_all) = (0, 0);
     for shape in SHAPES {
-        let built = shards(&mut random, shape);
+        let built = shards(&mut random, shape, false);
         let views = views(&built);
         for (n_negatives, precision, is_near) in [
             (0, Precision::Exact, false),
@@ -190,7 +186,7 @@ fn measured_errors_decide_as_defined() {
     let mut random = Random::new(24);
     let (mut n_fine, mut n_embeddings, mut n_all) = (0, 0, 0);
     for shape in SHAPES.into_iter().filter(|shape| shape.3 > 0) {
-        let built = shards_of(&mut random, shape, true);
+        let built = shards(&mut random, shape, true);
         let views = views(&built);
         for n_negatives in [0, 2] {
             let question = random_question(&mut random, shape.0, n_negatives);
@@ -278,15 +274,14 @@ fn measured_errors_decide_as_defined() {
 fn the_largest_numbers_do_no_harm() {
     let mut random = Random::new(23);
     for (at, shape) in SHAPES.into_iter().enumerate() {
-        let built = shards(&mut random, shape);
+        let built = shards(&mut random, shape, false);
         let view = built[0].view();
         let mut header = view.header;
         header.centroid_step = 64.0;
         let centroids = vec![-128i8; view.centroids.len()];
         let (mean, vectors) = (vec![f16::MAX; shape.0], vec![-128i8; shape.0 * shape.1]);
         let steps = vec![64.0; shape.1];
-        let basis =
-            view.basis.map(|_| slag_common::shard::Basis { mean: &mean, vectors: &vectors, steps: &steps });
+        let basis = view.basis.map(|_| Basis { mean: &mean, vectors: &vectors, steps: &steps });
         let n = view.header.n_centroids as usize;
         let codewords: Vec<f16> = match view.residuals {
             Some(residuals) => {
@@ -296,21 +291,14 @@ fn the_largest_numbers_do_no_harm() {
         };
         let (scales, residual_norms, radii) =
             (vec![64.0; n], vec![if at % 2 == 0 { 0.0 } else { 64.0 }; n], vec![64.0; n]);
-        let residuals = view.residuals.map(|old| slag_common::shard::Residuals {
+        let residuals = view.residuals.map(|old| Residuals {
             codewords: &codewords,
             residual_scales: &scales,
             residual_norms: &residual_norms,
             ..old
         });
         let mut bytes = Vec::new();
-        let hostile = slag_common::shard::ShardView {
-            header,
-            centroids: &centroids,
-            basis,
-            residuals,
-            radii: &radii,
-            ..view
-        };
+        let hostile = ShardView { header, centroids: &centroids, basis, residuals, radii: &radii, ..view };
         hostile.write(&mut bytes).expect("writes to memory");
         let bytes = AlignedBytes::copy_of(&bytes);
         let layout = ShardLayout::check(&bytes).expect("allowed");

@@ -286,15 +286,7 @@ pub(super) fn make(
 }
 
 fn identity(scene: &Gaussians, planned: &ViewpointSettings, device: &str) -> Result<Hash32, EncodeError> {
-    let columns: [&[u8]; 6] = [
-        bytemuck::cast_slice(&scene.means_in_world),
-        bytemuck::cast_slice(&scene.rotations_wxyz),
-        bytemuck::cast_slice(&scene.scales),
-        bytemuck::cast_slice(&scene.opacities),
-        bytemuck::cast_slice(&scene.sh_dc),
-        bytemuck::cast_slice(&scene.sh_rest),
-    ];
-    let columns = columns.map(|column| Hash32::of(column).to_string());
+    let columns = hashes_of_columns(scene).map(|hash| hash.to_string());
     hash_of(&(PLAN_VERSION, env!("CARGO_PKG_VERSION"), device, planned, scene.sh_degree, columns))
 }
 
@@ -405,7 +397,7 @@ pub(crate) fn of_scene(
         },
         segmenter: segmenter.identity(),
         rasterizer,
-        scene: hash_scene(scene),
+        scene: Hash32::of(&hashes_of_columns(scene).map(|hash| hash.0)[..4].concat()),
         settings,
         cells,
     })
@@ -415,14 +407,17 @@ fn hash_of(identity: &impl Serialize) -> Result<Hash32, EncodeError> {
     Ok(Hash32::of(&serde_json::to_vec(identity).map_err(std::io::Error::from)?))
 }
 
-fn hash_scene(scene: &Gaussians) -> Hash32 {
-    let columns: [&[u8]; 4] = [
+/// The last two are of colours.
+fn hashes_of_columns(scene: &Gaussians) -> [Hash32; 6] {
+    let columns: [&[u8]; 6] = [
         bytemuck::cast_slice(&scene.means_in_world),
         bytemuck::cast_slice(&scene.rotations_wxyz),
         bytemuck::cast_slice(&scene.scales),
         bytemuck::cast_slice(&scene.opacities),
+        bytemuck::cast_slice(&scene.sh_dc),
+        bytemuck::cast_slice(&scene.sh_rest),
     ];
-    Hash32::of(&columns.map(|column| Hash32::of(column).0).concat())
+    columns.map(Hash32::of)
 }
 
 #[cfg(test)]

@@ -161,7 +161,7 @@ pub struct CellSettings {
     pub landmarks: bool,
 }
 
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct OutputSettings {
     pub store: PathBuf,
     pub scene_name: String,
@@ -262,13 +262,7 @@ impl EncodeSettings {
                 photo_poses: false,
                 landmarks: false,
             },
-            output: OutputSettings {
-                store,
-                scene_name: "scene".into(),
-                created_unix_secs: 0,
-                models: None,
-                text_model: false,
-            },
+            output: OutputSettings { store, scene_name: "scene".into(), ..OutputSettings::default() },
             run: RunSettings {
                 threads: std::thread::available_parallelism().map_or(1, usize::from),
                 memory_bytes: 2 << 30,

@@ -180,25 +180,14 @@ fn hopeless_voxels_grow() {
     ];
     let shard = TestShard { step: DVec3::splat(1e4), ..TestShard::new(vec![members]) }.build(false);
     let runs = [Run { shard: 0, start: 0, end: 2, score: 0.5 }];
+    let found = |voxel: f64| {
+        let grouping = Grouping { voxel, min_count: 1, ..GROUPING };
+        cluster(&[shard.view()], &runs, &grouping, &Budget::default())
+    };
     for voxel in [f64::MIN_POSITIVE, 1e-9, 0.25] {
-        let found = cluster(
-            &[shard.view()],
-            &runs,
-            &Grouping { voxel, min_count: 1, ..GROUPING },
-            &Budget::default(),
-        );
+        let found = found(voxel);
         assert_eq!(found.clusters.len(), 2);
         assert!(found.voxel >= 65535e4 / f64::from(1 << AXIS_BITS), "{}", found.voxel);
     }
-    assert_eq!(
-        cluster(
-            &[shard.view()],
-            &runs,
-            &Grouping { voxel: 1e300, min_count: 1, ..GROUPING },
-            &Budget::default()
-        )
-        .clusters
-        .len(),
-        1
-    );
+    assert_eq!(found(1e300).clusters.len(), 1);
 }

@@ -25,7 +25,7 @@ pub(crate) enum EvalCommand {
     Defaults(run::ScenesArgs),
     /// Compares drawings of planned views with as many photos on labelled scenes, with automatic masks.
     SplatOnly(run::ScenesArgs),
-    /// Judges segmenters without words: by labelled photos, and by coverage.
+    /// Judges segmenters without words: by labelled photos, by coverage, and by agreement between views.
     Masks(masks::MasksArgs),
     /// Judges the names of objects and their confidences by labels.
     Names(names::NamesArgs),
@@ -40,7 +40,8 @@ pub(crate) enum EvalCommand {
     Goal(goal::GoalArgs),
     /// Finds the cameras of photos that a map of landmarks has not seen; photos of the other scenes must be lost.
     Locate(locate::LocateArgs),
-    /// Asks the robot's program for things by their relations in generated scenes.
+    /// Asks the robot's program for things by their relations in generated scenes, beside the plain phrase and the
+    /// noun.
     Relations(relations::RelationsArgs),
 }
 

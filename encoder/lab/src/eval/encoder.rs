@@ -12,6 +12,7 @@ use serde::Serialize;
 use slag_encoder::cli::common::{ModelArgs, open_models};
 use slag_models::{Crop, TextEncoder};
 
+use super::judge::ABSENT;
 use crate::generate::crops::{self, Label, Split};
 use crate::generate::grammar::{NOUNS, Noun};
 use crate::generate::paint::{Colour, Material};
@@ -19,11 +20,6 @@ use crate::harness::Times;
 use crate::table::Table;
 use slag_encoder::progress::Progress;
 use slag_math::dot;
-
-/// Categories absent from most scenes.
-const ABSENT: &str = "elephant, airplane, boat, piano, guitar, horse, cat, bird, fish, snake, banana, pizza, train, \
-    helicopter, bathtub, toilet, shower, umbrella, bicycle, motorcycle, tent, ladder, tractor, \
-    traffic light";
 
 /// A crop shows a whole thing if its mask is the true one and more than this share of the thing is visible.
 const WHOLE: f64 = 0.6;
@@ -58,6 +54,8 @@ struct NounReport {
     noun: String,
     n_crops: usize,
     n_right: usize,
+    /// Most frequent wrong answers, with their counts.
+    taken_for: Vec<(String, usize)>,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -97,7 +95,7 @@ impl Texts {
             materials: encode(
                 Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect(),
             )?,
-            absent: encode(ABSENT.split(", ").map(|thing| format!("a {thing}")).collect())?,
+            absent: encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?,
         })
     }
 }
@@ -153,7 +151,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
         threshold,
         found: share(found[0], 1),
         found_others: share(found[1], nouns.len() - 1),
-        found_absent: share(found[2], texts.absent.len()),
+        found_absent: share(found[2], ABSENT.len()),
         ms_per_crop: crop_times.median_ms,
         ms_per_text: text_times.median_ms,
     })
@@ -194,18 +192,20 @@ fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
 }
 
 fn of_each_noun(seen: &[Seen], nouns: &[Noun]) -> Vec<NounReport> {
-    let mut counts = vec![(0, 0); nouns.len()];
-    for (label, noun, ..) in seen.iter().filter(|seen| is_whole(&seen.0)) {
-        let (n_crops, n_right) = &mut counts[label.noun];
-        *n_crops += 1;
-        *n_right += usize::from(*noun == label.noun);
-    }
-    let report = |(noun, (n_crops, n_right)): (&Noun, (usize, usize))| NounReport {
-        noun: noun.name.clone(),
-        n_crops,
-        n_right,
+    // Confusion matrix over whole things: answers by true noun.
+    let mut counts = vec![vec![0; nouns.len()]; nouns.len()];
+    seen.iter().filter(|s| is_whole(&s.0)).for_each(|(label, noun, ..)| counts[label.noun][*noun] += 1);
+    let report = |(i, counts): (usize, &Vec<usize>)| {
+        let mut others: Vec<usize> = (0..nouns.len()).filter(|j| *j != i && counts[*j] > 0).collect();
+        others.sort_by_key(|j| (std::cmp::Reverse(counts[*j]), *j));
+        NounReport {
+            noun: nouns[i].name.clone(),
+            n_crops: counts.iter().sum(),
+            n_right: counts[i],
+            taken_for: others.iter().take(3).map(|j| (nouns[*j].name.clone(), counts[*j])).collect(),
+        }
     };
-    nouns.iter().zip(counts).map(report).collect()
+    counts.iter().enumerate().map(report).collect()
 }
 
 impl fmt::Display for EncoderReport {
@@ -218,9 +218,12 @@ impl fmt::Display for EncoderReport {
             table.row([name.clone(), t.n_crops.to_string()].into_iter().chain(figures));
         }
         writeln!(f, "{table}")?;
-        let mut table = Table::new(["noun", "crops", "%"]);
-        for NounReport { noun, n_crops, n_right } in &self.nouns {
-            table.row([noun.clone(), n_crops.to_string(), percent(*n_right, *n_crops)]);
+        let mut table = Table::new(["noun", "crops", "%", "taken for"]);
+        for noun in &self.nouns {
+            let others: Vec<String> =
+                noun.taken_for.iter().map(|(other, n)| format!("{other} {n}")).collect();
+            let figures = [noun.n_crops.to_string(), percent(noun.n_right, noun.n_crops), others.join(", ")];
+            table.row(std::iter::once(noun.noun.clone()).chain(figures));
         }
         writeln!(f, "{table}")?;
         if let (Some(threshold), Some(own), Some(others), Some(absent)) =

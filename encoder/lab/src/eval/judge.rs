@@ -7,15 +7,49 @@ use std::path::PathBuf;
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
+use slag_common::manifest::Calibration;
 use slag_common::shard::Profile;
 use slag_encoder::query::{self, PublishedObjects};
 use slag_encoder::store::StoreReader;
 use slag_models::TextEncoder;
 
-use super::instances::{Recall, recall};
-use super::metrics::{Confusion, area_under_roc, average_precision, mean};
+use super::instances::{self, InstanceReport};
+use super::metrics::{Confusion, area_under_roc, average_precision, iou_of_sets, mean};
 use super::truth::Truth;
 use crate::table::{Table, figure};
+
+/// A query with fewer matching Gaussians counts as unanswered.
+const MIN_ANSWER: usize = 10;
+/// Sizes of the reported class lists, as in the ScanNet protocol; the largest categories come first.
+const SUBSETS: [usize; 3] = [19, 15, 10];
+
+/// Negative queries: categories absent from most scenes. Those that a scene does have are left out.
+pub(super) const ABSENT: [&str; 24] = [
+    "elephant",
+    "airplane",
+    "boat",
+    "piano",
+    "guitar",
+    "horse",
+    "cat",
+    "bird",
+    "fish",
+    "snake",
+    "banana",
+    "pizza",
+    "train",
+    "helicopter",
+    "bathtub",
+    "toilet",
+    "shower",
+    "umbrella",
+    "bicycle",
+    "motorcycle",
+    "tent",
+    "ladder",
+    "tractor",
+    "traffic light",
+];
 
 /// What is scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
@@ -39,6 +73,9 @@ pub(crate) struct JudgeSettings {
     /// Scores this profile's shards, as a robot does [default: the field in full precision].
     #[arg(long, value_name = "NAME")]
     pub(crate) profile: Option<Profile>,
+    /// Lowest score of a match [default: the store's].
+    #[arg(long, value_name = "COSINE")]
+    pub(crate) threshold: Option<f32>,
     /// What is scored [default: objects, where the scene has them].
     #[arg(long, value_enum)]
     pub(crate) kind: Option<EvalKind>,
@@ -69,8 +106,17 @@ pub(crate) struct WordReport {
     iou: Option<f64>,
     /// Share of its Gaussians that the argmax assigns to it.
     accuracy: Option<f64>,
+    iou_at_threshold: Option<f64>,
     average_precision: Option<f64>,
     area_under_roc: Option<f64>,
+}
+
+/// Means over a list of classes.
+#[derive(Clone, Debug, Serialize)]
+pub(crate) struct Subset {
+    pub(crate) n_classes: usize,
+    pub(crate) miou: Option<f64>,
+    pub(crate) macc: Option<f64>,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -79,14 +125,17 @@ pub(crate) struct EvalReport {
     /// Profile of the scored shards; absent for the full field.
     profile: Option<Profile>,
     pub(crate) kind: EvalKind,
-    /// Things that objects find; only where objects were scored.
-    pub(crate) instances: Option<Recall>,
+    /// Only where objects were scored.
+    pub(crate) instances: Option<InstanceReport>,
+    threshold: f32,
     words: Vec<WordReport>,
-    /// Means over the words, as the columns of their names.
-    pub(crate) miou: Option<f64>,
-    macc: Option<f64>,
+    /// All classes, and the largest ones.
+    pub(crate) multi_class: Vec<Subset>,
+    mean_iou_at_threshold: Option<f64>,
     pub(crate) mean_average_precision: Option<f64>,
     pub(crate) mean_area_under_roc: Option<f64>,
+    /// Negative queries: how many found nothing, and how many there were.
+    pub(crate) abstained: [usize; 2],
     /// Words that the encoder cannot encode, and why; no mean counts them.
     unknown_words: BTreeMap<String, String>,
     /// Gaussians of the words' things without an embedding; they count as wrong.
@@ -108,21 +157,36 @@ pub(crate) fn judge(
     };
     let mut asker = Asker { reader, objects: objects.as_ref(), encoder, settings, unknown: BTreeMap::new() };
     let classes = asker.classes(truth)?;
+    let thresholds = Thresholds::of(reader, objects.as_ref(), settings);
+    let abstained = asker.abstained(truth, thresholds.of_gaussians)?;
     let things = Things::of(truth, &classes);
-    let confusion = things.confusion(&classes);
-    let of_class = |(c, class): (usize, &Class)| things.report(c, class, &confusion);
+    let whole = things.confusion(&classes, classes.len());
+    let subset = |n: usize| {
+        let confusion = things.confusion(&classes, n);
+        let (iou, accuracy) = (|c| confusion.iou(c), |c| confusion.accuracy(c));
+        Subset { n_classes: n, miou: mean((0..n).map(iou)), macc: mean((0..n).map(accuracy)) }
+    };
+    let sizes = std::iter::once(classes.len()).chain(SUBSETS.into_iter().filter(|n| *n < classes.len()));
+    let of_class = |(c, class): (usize, &Class)| things.retrieval(c, class, &whole, thresholds.of_gaussians);
     let words: Vec<WordReport> = classes.iter().enumerate().map(of_class).collect();
     let is_unanswered = |(i, c): &&(usize, Option<usize>)| c.is_some() && classes[0].cosines[*i].is_nan();
     Ok(EvalReport {
         encoder: reader.manifest().encoder.name.clone(),
         profile: settings.profile,
         kind: if objects.is_some() { EvalKind::Objects } else { EvalKind::Gaussians },
-        instances: objects.as_ref().map(|objects| recall(truth, &objects.object_of)),
-        miou: mean(words.iter().map(|w| w.iou)),
-        macc: mean(words.iter().map(|w| w.accuracy)),
+        instances: objects.as_ref().map(|objects| {
+            let ids: Vec<_> = classes.iter().map(|class| (class.word.clone(), class.ids.clone())).collect();
+            let scores: Vec<Vec<f32>> = classes.iter().map(|class| class.of_objects.clone()).collect();
+            let n_objects = objects.ids.len();
+            instances::report(truth, &objects.object_of, n_objects, &ids, &scores, thresholds.of_objects)
+        }),
+        threshold: thresholds.of_gaussians,
+        multi_class: sizes.map(subset).collect(),
+        mean_iou_at_threshold: mean(words.iter().map(|w| w.iou_at_threshold)),
         mean_average_precision: mean(words.iter().map(|w| w.average_precision)),
         mean_area_under_roc: mean(words.iter().map(|w| w.area_under_roc)),
         words,
+        abstained,
         unknown_words: asker.unknown,
         n_without_evidence: things.gaussians.iter().filter(is_unanswered).count(),
         n_unlabelled: things.n_unlabelled,
@@ -134,6 +198,8 @@ struct Class {
     ids: Vec<u16>,
     /// `[N]`; NaN without evidence.
     cosines: Vec<f32>,
+    /// By object; empty where objects are not scored.
+    of_objects: Vec<f32>,
 }
 
 struct Asker<'a> {
@@ -145,8 +211,8 @@ struct Asker<'a> {
 }
 
 impl Asker<'_> {
-    /// Scores of Gaussians, mixed with those of their objects; `None` for a word unknown to the encoder.
-    fn score(&mut self, word: &str) -> Result<Option<Vec<f32>>> {
+    /// Scores of Gaussians and of objects; `None` for a word unknown to the encoder.
+    fn score(&mut self, word: &str) -> Result<Option<(Vec<f32>, Vec<f32>)>> {
         // A synonym's results say nothing about the word itself.
         let asked_as = self.encoder.known_phrases().and_then(|known| known.asked_as(word));
         let encoded = match asked_as {
@@ -164,17 +230,18 @@ impl Asker<'_> {
             Some(profile) => query::scores_of_shards(self.reader, &vector, profile)?,
             None => query::scores(self.reader, &vector)?,
         };
+        let of_objects = self.objects.map(|objects| objects.scores(&vector)).unwrap_or_default();
         if let Some(objects) = self.objects {
-            objects.overlay(&objects.scores(&vector), &mut scores.cosines);
+            objects.overlay(&of_objects, &mut scores.cosines);
         }
-        Ok(Some(scores.cosines))
+        Ok(Some((scores.cosines, of_objects)))
     }
 
     fn classes(&mut self, truth: &Truth) -> Result<Vec<Class>> {
         let mut classes = Vec::new();
         for (word, ids) in truth.categories() {
-            if let Some(cosines) = self.score(&word)? {
-                classes.push(Class { word, ids, cosines });
+            if let Some((cosines, of_objects)) = self.score(&word)? {
+                classes.push(Class { word, ids, cosines, of_objects });
             }
         }
         match self.unknown.first_key_value() {
@@ -183,6 +250,48 @@ impl Asker<'_> {
                 bail!("the encoder knows none of {} words ({word}: {error})", self.unknown.len())
             }
             None => bail!("the labels name no things"),
+        }
+    }
+
+    /// Returns the numbers of absent categories that find nothing and that were asked.
+    fn abstained(&mut self, truth: &Truth, threshold: f32) -> Result<[usize; 2]> {
+        let is_present = |word: &str| {
+            let mut things = truth.things.iter().chain(&truth.background);
+            things.any(|t| t.category.contains(word) || t.words.iter().any(|w| w.contains(word)))
+        };
+        let mut abstained = [0, 0];
+        for word in ABSENT.into_iter().filter(|word| !is_present(word)) {
+            if let Some((cosines, _)) = self.score(word)? {
+                let n = cosines.iter().filter(|c| **c >= threshold).count();
+                abstained[0] += usize::from(n < MIN_ANSWER);
+                abstained[1] += 1;
+            }
+        }
+        Ok(abstained)
+    }
+}
+
+struct Thresholds {
+    of_gaussians: f32,
+    of_objects: f32,
+}
+
+impl Thresholds {
+    fn of(reader: &StoreReader, objects: Option<&PublishedObjects>, settings: &JudgeSettings) -> Self {
+        let record = &reader.manifest().encoder;
+        let of_scene = record.default_threshold;
+        let of_objects = match (objects, record.calibration) {
+            // A scene's own threshold lies three spreads above the mean of the scores, here those of objects.
+            (Some(objects), Some(_)) => {
+                let Calibration { score_mean, score_spread } = objects.calibration;
+                (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
+            }
+            _ => of_scene,
+        };
+        let of_gaussians = if objects.is_some() { query::mixed(of_scene, of_objects) } else { of_scene };
+        Self {
+            of_gaussians: settings.threshold.unwrap_or(of_gaussians),
+            of_objects: settings.threshold.unwrap_or(of_objects),
         }
     }
 }
@@ -211,28 +320,30 @@ impl Things {
         Self { gaussians, n_unlabelled }
     }
 
-    /// Counts the best class at each Gaussian; ties go to the first.
-    fn confusion(&self, classes: &[Class]) -> Confusion {
-        let mut confusion = Confusion::new(classes.len());
+    /// Counts the best of the first `n_classes` classes at each Gaussian; ties go to the first.
+    fn confusion(&self, classes: &[Class], n_classes: usize) -> Confusion {
+        let mut confusion = Confusion::new(n_classes);
         for (gaussian, class) in &self.gaussians {
-            let Some(class) = class else { continue };
+            let Some(class) = class.filter(|class| *class < n_classes) else { continue };
             let score = |c: &usize| classes[*c].cosines[*gaussian];
-            let known = (0..classes.len()).filter(|c| !score(c).is_nan());
-            confusion.count(*class, known.max_by(|a, b| score(a).total_cmp(&score(b)).then(b.cmp(a))));
+            let known = (0..n_classes).filter(|c| !score(c).is_nan());
+            confusion.count(class, known.max_by(|a, b| score(a).total_cmp(&score(b)).then(b.cmp(a))));
         }
         confusion
     }
 
-    fn report(&self, c: usize, class: &Class, confusion: &Confusion) -> WordReport {
+    fn retrieval(&self, c: usize, class: &Class, whole: &Confusion, threshold: f32) -> WordReport {
         let positive: Vec<bool> = self.gaussians.iter().map(|(_, of)| *of == Some(c)).collect();
         // Gaussians without evidence rank below all others.
         let score = |(i, _): &(usize, _)| Some(class.cosines[*i]).filter(|s| !s.is_nan()).unwrap_or(-2.0);
         let scores: Vec<f32> = self.gaussians.iter().map(score).collect();
+        let found = scores.iter().map(|score| *score >= threshold);
         WordReport {
             word: class.word.clone(),
             n_gaussians: positive.iter().filter(|p| **p).count(),
-            iou: confusion.iou(c),
-            accuracy: confusion.accuracy(c),
+            iou: whole.iou(c),
+            accuracy: whole.accuracy(c),
+            iou_at_threshold: iou_of_sets(found.zip(positive.iter().copied())),
             average_precision: average_precision(&scores, &positive),
             area_under_roc: area_under_roc(&scores, &positive),
         }
@@ -241,17 +352,21 @@ impl Things {
 
 impl fmt::Display for EvalReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut table = Table::new(["word", "Gaussians", "IoU", "acc", "AP", "AUC"]);
+        let mut table = Table::new(["word", "Gaussians", "IoU", "acc", "IoU@thr", "AP", "AUC"]);
         for w in &self.words {
-            let figures = [w.iou, w.accuracy, w.average_precision, w.area_under_roc];
+            let figures = [w.iou, w.accuracy, w.iou_at_threshold, w.average_precision, w.area_under_roc];
             table.row([w.word.clone(), w.n_gaussians.to_string()].into_iter().chain(figures.map(figure)));
         }
         writeln!(f, "{table}")?;
-        let means = [self.miou, self.macc, self.mean_average_precision, self.mean_area_under_roc];
-        let [miou, macc, ap, auc] = means.map(figure);
-        writeln!(f, "{} words: mIoU {miou}, mAcc {macc}, AP {ap}, AUC {auc}", self.words.len())?;
+        for s in &self.multi_class {
+            writeln!(f, "{} classes: mIoU {}, mAcc {}", s.n_classes, figure(s.miou), figure(s.macc))?;
+        }
+        let [at_threshold, ap, auc] =
+            [self.mean_iou_at_threshold, self.mean_average_precision, self.mean_area_under_roc].map(figure);
+        writeln!(f, "means: IoU at threshold {:.3} {at_threshold}, AP {ap}, AUC {auc}", self.threshold)?;
+        writeln!(f, "negative queries: {} of {} found nothing", self.abstained[0], self.abstained[1])?;
         if let Some(found) = &self.instances {
-            writeln!(f, "things found at IoU 0.5: {found}")?;
+            write!(f, "{found}")?;
         }
         if !self.unknown_words.is_empty() {
             let words: Vec<&str> = self.unknown_words.keys().map(String::as_str).collect();

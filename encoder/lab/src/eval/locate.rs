@@ -30,8 +30,11 @@ const HELD_OUT: usize = 4;
 /// Most foreign photos tried in a scene, evenly spread over all.
 const MAX_FOREIGN: usize = 48;
 const FOCAL_FACTOR: f64 = 1.03;
+const DARK_FACTOR: f32 = 0.4;
 /// Step to which a robot's positions are rounded where the scene is metric, metres.
 const POSITION_STEP_M: f64 = 0.02;
+/// Width of the square of [`Change::Covered`], as a share of each side: 20 % of the area.
+const COVERED_SIDE: f64 = 0.447;
 /// One thing in this many is moved, and by this many metres.
 const MOVED_THINGS: u16 = 3;
 const MOVED_M: f64 = 1.0;
@@ -45,14 +48,23 @@ pub(crate) struct LocateArgs {
     /// Changes each query.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
+    /// Tells each query that was not found where it is.
+    #[arg(long)]
+    list: bool,
 }
 
 /// How queries differ from their photos.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Change {
     None,
+    /// 40 % of the light.
+    Dark,
+    /// Half the resolution, and back.
+    Blurred,
     /// The focal length is stated 3 % too large.
     Focal,
+    /// A grey square hides 20 % of the photo.
+    Covered,
     /// The splat drawn in the photo's place.
     Drawn,
     /// The same, with a third of the labelled things 1 m from where the map has them.
@@ -63,20 +75,22 @@ struct Located {
     name: String,
     gaussians: Gaussians,
     map: Map,
+    len_bytes: u64,
+    map_secs: f64,
     queries: Vec<View>,
     /// What queries show instead of their photos.
     drawn: Option<Gaussians>,
 }
 
+/// Errors in metres and degrees, or why the query was not found.
 struct Try {
-    /// Errors in metres and degrees; `None` if the query was not found.
-    found: Option<[f64; 2]>,
+    found: Result<[f64; 2], String>,
     secs: f64,
 }
 
 impl Try {
     fn is_within(&self, metres: f64, degrees: f64) -> bool {
-        self.found.is_some_and(|[m, deg]| m <= metres && deg <= degrees)
+        self.found.as_ref().is_ok_and(|[m, deg]| *m <= metres && *deg <= degrees)
     }
 }
 
@@ -97,6 +111,7 @@ struct Figures {
     n: usize,
     n_foreign: usize,
     within_25cm_5deg: Option<f64>,
+    within_1m_10deg: Option<f64>,
     lost: Option<f64>,
     /// Found, but further away than 1 m or 10 degrees.
     wrong: Option<f64>,
@@ -104,6 +119,9 @@ struct Figures {
     /// Median error of those that were found.
     median_m: Option<f64>,
     median_secs: Option<f64>,
+    bytes_per_million: Option<f64>,
+    #[serde(skip)]
+    map_secs: f64,
 }
 
 pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateReport> {
@@ -120,20 +138,31 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         let attempt = |of: usize, view: &View| -> Result<Try> {
             Ok(attempt(scene, &query(view, args.change, drawn[of].as_deref())?, &renderer))
         };
-        let tries = scene.queries.iter().map(|view| attempt(at, view)).collect::<Result<Vec<_>>>()?;
+        let mut tries = Vec::new();
+        for view in &scene.queries {
+            let one = attempt(at, view)?;
+            if args.list && !one.is_within(0.25, 5.0) {
+                let told = match &one.found {
+                    Err(reason) => reason.clone(),
+                    Ok([m, deg]) => format!("off by {m:.2} m, {deg:.1} degrees"),
+                };
+                tracing::warn!("{} {}: {told}", scene.name, view.name);
+            }
+            tries.push(one);
+        }
         let others = (0..scenes.len()).filter(|other| *other != at);
         let others: Vec<(usize, &View)> =
             others.flat_map(|other| scenes[other].queries.iter().map(move |view| (other, view))).collect();
         let others: Vec<_> = others.iter().step_by(others.len().div_ceil(MAX_FOREIGN).max(1)).collect();
         let foreign =
             others.par_iter().map(|(other, view)| attempt(*other, view)).collect::<Result<Vec<_>>>()?;
-        of_scenes.push(Figures::of(&scene.name, &tries, &foreign));
+        of_scenes.push(Figures::of(&scene.name, &[scene], &tries, &foreign));
         all_tries.extend(tries);
         all_foreign.extend(foreign);
         progress.advance(1);
     }
     progress.end();
-    let all = Figures::of("all", &all_tries, &all_foreign);
+    let all = Figures::of("all", &scenes.iter().collect::<Vec<_>>(), &all_tries, &all_foreign);
     Ok(LocateReport { all, scenes: of_scenes })
 }
 
@@ -142,6 +171,7 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     let views = poses::read(&files.poses, files.images.as_deref())?.views;
     // The last photo of each group.
     let is_query = |at: usize| at % HELD_OUT == HELD_OUT - 1;
+    let start = Instant::now();
     let loaded = CpuRasterizer.load(&gaussians)?;
     let mapping = views.iter().enumerate().filter(|(at, _)| !is_query(*at));
     let mapping: Vec<MappingView> = mapping
@@ -166,6 +196,8 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     Ok(Located {
         name: files.name.clone(),
         map: Map::new(built.view().map(|view| view.iter().collect()).unwrap_or_default()),
+        len_bytes: built.len_bytes(),
+        map_secs: start.elapsed().as_secs_f64(),
         gaussians: on_board(&gaussians),
         queries,
         drawn,
@@ -210,11 +242,8 @@ fn query(view: &View, change: Change, drawn: Option<&dyn LoadedScene>) -> Result
         None => loaded.image,
     };
     let (width, height) = image.dimensions();
-    if change == Change::Focal {
-        intrinsics.focal_x_px *= FOCAL_FACTOR;
-        intrinsics.focal_y_px *= FOCAL_FACTOR;
-    }
-    let grey = Grey::from_rgb8(width as usize, height as usize, image.as_raw());
+    let mut grey = Grey::from_rgb8(width as usize, height as usize, image.as_raw());
+    changed(change, &mut grey, &mut intrinsics);
     Ok(Query { grey, intrinsics, camera_from_world })
 }
 
@@ -230,15 +259,46 @@ fn attempt(scene: &Located, query: &Query, renderer: &dyn Renderer) -> Try {
             let metres = truth.inverse().translation.distance(pose.inverse().translation);
             let between = glam::DQuat::from_mat3(&(pose.matrix3 * truth.matrix3.transpose()));
             let degrees = between.to_axis_angle().1.to_degrees();
-            Some([metres, degrees.min(360.0 - degrees)])
+            Ok([metres, degrees.min(360.0 - degrees)])
         }
-        Outcome::Unsure(_) | Outcome::Lost(_) => None,
+        Outcome::Unsure(_) => Err("unsure".into()),
+        Outcome::Lost(reason) => Err(reason.to_string()),
     };
     Try { found, secs }
 }
 
+fn changed(change: Change, grey: &mut Grey, intrinsics: &mut Intrinsics) {
+    let (width, height) = (grey.width, grey.height);
+    match change {
+        Change::None | Change::Drawn | Change::Moved => {}
+        Change::Dark => grey.values.iter_mut().for_each(|v| *v = (*v * DARK_FACTOR * 255.0).round() / 255.0),
+        Change::Blurred => {
+            let sharp = grey.values.clone();
+            for y in 0..height {
+                for x in 0..width {
+                    let (x0, y0) = (x / 2 * 2, y / 2 * 2);
+                    let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
+                    let corners = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)];
+                    grey.values[y * width + x] =
+                        0.25 * corners.map(|(x, y)| sharp[y * width + x]).iter().sum::<f32>();
+                }
+            }
+        }
+        Change::Focal => {
+            intrinsics.focal_x_px *= FOCAL_FACTOR;
+            intrinsics.focal_y_px *= FOCAL_FACTOR;
+        }
+        Change::Covered => {
+            let side = |n: usize| (n as f64 * COVERED_SIDE) as usize;
+            for y in height / 4..height / 4 + side(height) {
+                grey.values[y * width + width / 4..][..side(width)].fill(0.5);
+            }
+        }
+    }
+}
+
 impl Figures {
-    fn of(name: &str, tries: &[Try], foreign: &[Try]) -> Self {
+    fn of(name: &str, scenes: &[&Located], tries: &[Try], foreign: &[Try]) -> Self {
         let share = |n: usize, of: usize| (of > 0).then(|| n as f64 / of as f64);
         let of_tries =
             |is: &dyn Fn(&Try) -> bool| share(tries.iter().filter(|one| is(one)).count(), tries.len());
@@ -246,29 +306,51 @@ impl Figures {
             values.sort_by(f64::total_cmp);
             values.get(values.len() / 2).copied()
         };
+        let n_gaussians: usize = scenes.iter().map(|scene| scene.gaussians.len()).sum();
+        let len_bytes: u64 = scenes.iter().map(|scene| scene.len_bytes).sum();
         Self {
             name: name.to_owned(),
             n: tries.len(),
             n_foreign: foreign.len(),
             within_25cm_5deg: of_tries(&|one| one.is_within(0.25, 5.0)),
-            lost: of_tries(&|one| one.found.is_none()),
-            wrong: of_tries(&|one| one.found.is_some() && !one.is_within(1.0, 10.0)),
-            foreign_accepted: share(foreign.iter().filter(|one| one.found.is_some()).count(), foreign.len()),
-            median_m: median(tries.iter().filter_map(|one| Some(one.found?[0])).collect()),
+            within_1m_10deg: of_tries(&|one| one.is_within(1.0, 10.0)),
+            lost: of_tries(&|one| one.found.is_err()),
+            wrong: of_tries(&|one| one.found.is_ok() && !one.is_within(1.0, 10.0)),
+            foreign_accepted: share(foreign.iter().filter(|one| one.found.is_ok()).count(), foreign.len()),
+            median_m: median(tries.iter().filter_map(|one| Some(one.found.as_ref().ok()?[0])).collect()),
             median_secs: median(tries.iter().map(|one| one.secs).collect()),
+            bytes_per_million: (n_gaussians > 0).then(|| len_bytes as f64 * 1e6 / n_gaussians as f64),
+            map_secs: scenes.iter().map(|scene| scene.map_secs).sum(),
         }
     }
 }
 
 impl fmt::Display for LocateReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let columns = "scene|n|0.25 m, 5 deg|lost|wrong|median m|median s|foreign|accepted";
-        let mut table = Table::new(columns.split('|'));
+        let mut table = Table::new([
+            "scene",
+            "n",
+            "0.25 m, 5 deg",
+            "1 m, 10 deg",
+            "lost",
+            "wrong",
+            "median m",
+            "median s",
+            "foreign",
+            "accepted",
+            "bytes a million",
+            "map s",
+        ]);
         for of in self.scenes.iter().chain([&self.all]) {
-            let shares = [of.within_25cm_5deg, of.lost, of.wrong, of.median_m, of.median_secs];
+            let shares =
+                [of.within_25cm_5deg, of.within_1m_10deg, of.lost, of.wrong, of.median_m, of.median_secs];
             let mut row = vec![of.name.clone(), of.n.to_string()];
             row.extend(shares.map(figure));
             row.extend([of.n_foreign.to_string(), figure(of.foreign_accepted)]);
+            row.extend([
+                of.bytes_per_million.map_or("-".into(), |b| format!("{b:.0}")),
+                format!("{:.1}", of.map_secs),
+            ]);
             table.row(row);
         }
         write!(f, "{table}")

@@ -7,11 +7,13 @@ pub(super) fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     if n_positive == 0.0 || n_negative == 0.0 {
         return None;
     }
+    let order = descending(scores);
     // Ranks from the worst; equal scores share their mean rank.
     let (mut sum, mut i) = (0.0, 0);
-    for (same, more) in ties(scores, positive) {
-        let rank = scores.len() as f64 - i as f64 - (same as f64 - 1.0) / 2.0;
-        sum += rank * more;
+    while i < order.len() {
+        let same = order[i..].iter().take_while(|k| scores[**k] == scores[order[i]]).count();
+        let rank = order.len() as f64 - i as f64 - (same as f64 - 1.0) / 2.0;
+        sum += rank * order[i..i + same].iter().filter(|k| positive[**k]).count() as f64;
         i += same;
     }
     Some((sum - n_positive * (n_positive + 1.0) / 2.0) / (n_positive * n_negative))
@@ -24,8 +26,11 @@ pub(super) fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64
     if n_positive == 0.0 {
         return None;
     }
+    let order = descending(scores);
     let (mut sum, mut found, mut i) = (0.0, 0.0, 0);
-    for (same, more) in ties(scores, positive) {
+    while i < order.len() {
+        let same = order[i..].iter().take_while(|k| scores[**k] == scores[order[i]]).count();
+        let more = order[i..i + same].iter().filter(|k| positive[**k]).count() as f64;
         i += same;
         found += more;
         sum += more / n_positive * found / i as f64;
@@ -33,12 +38,10 @@ pub(super) fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64
     Some(sum)
 }
 
-/// For each score, highest first: how many have it, and how many of them are positive.
-fn ties(scores: &[f32], positive: &[bool]) -> Vec<(usize, f64)> {
+fn descending(scores: &[f32]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..scores.len()).collect();
     order.sort_unstable_by(|a, b| scores[*b].total_cmp(&scores[*a]));
-    let same = order.chunk_by(|a, b| scores[*a] == scores[*b]);
-    same.map(|same| (same.len(), same.iter().filter(|k| positive[**k]).count() as f64)).collect()
+    order
 }
 
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -102,7 +105,13 @@ mod tests {
         let (mut right, mut n) = (0.0, 0.0);
         for (a, _) in scores.iter().zip(&positive).filter(|(_, p)| **p) {
             for (b, _) in scores.iter().zip(&positive).filter(|(_, p)| !**p) {
-                right += f64::from(u8::from(a > b)) + 0.5 * f64::from(u8::from(a == b));
+                right += if a > b {
+                    1.0
+                } else if a == b {
+                    0.5
+                } else {
+                    0.0
+                };
                 n += 1.0;
             }
         }

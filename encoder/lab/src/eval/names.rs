@@ -70,6 +70,7 @@ struct Row {
     n_objects: usize,
     n_top_1: usize,
     n_top_3: usize,
+    mean_confidence: f64,
     /// Expected calibration error of the best names, by their confidence and, for comparison, by their cosine.
     calibration_error: f64,
     calibration_error_of_cosine: f64,
@@ -159,6 +160,7 @@ fn is_right(name: &str, thing: &Thing) -> bool {
 
 impl Row {
     fn new(scene: String, named: &[Named]) -> Self {
+        let n = named.len().max(1) as f64;
         let best = || named.iter().map(|named| named.names[0]);
         let by_cosine = named.iter().map(|named| (named.cosine.clamp(0.0, 1.0), named.names[0].1));
         Self {
@@ -166,6 +168,7 @@ impl Row {
             n_objects: named.len(),
             n_top_1: best().filter(|best| best.1).count(),
             n_top_3: named.iter().filter(|named| named.names.iter().any(|name| name.1)).count(),
+            mean_confidence: best().map(|best| f64::from(best.0)).sum::<f64>() / n,
             calibration_error: calibration_error(best()),
             calibration_error_of_cosine: calibration_error(by_cosine),
         }
@@ -187,11 +190,11 @@ fn calibration_error(names: impl Iterator<Item = (f32, bool)>) -> f64 {
 
 impl fmt::Display for NamesReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let columns = ["scene", "objects", "top-1", "top-3", "ECE", "ECE of the cosine"];
+        let columns = ["scene", "objects", "top-1", "top-3", "confidence", "ECE", "ECE of the cosine"];
         let mut table = Table::new(columns);
         for row in &self.rows {
             let share = |n: usize| percent(n as u64, row.n_objects as u64);
-            let figures = [row.calibration_error, row.calibration_error_of_cosine];
+            let figures = [row.mean_confidence, row.calibration_error, row.calibration_error_of_cosine];
             let cells =
                 [row.scene.clone(), row.n_objects.to_string(), share(row.n_top_1), share(row.n_top_3)];
             table.row(cells.into_iter().chain(figures.map(|of| figure(Some(of)))));

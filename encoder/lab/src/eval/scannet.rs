@@ -21,16 +21,45 @@ use slag_encoder::query;
 use slag_encoder::store::StoreReader;
 use slag_models::TextEncoder;
 
+use super::judge::Subset;
 use super::metrics::{Confusion, mean};
 use super::truth::check_scene;
 use crate::table::{Table, figure};
 
-const SCENES: &str = "scene0000_00 scene0062_00 scene0070_00 scene0097_00 scene0140_00 scene0200_00 scene0347_00 \
-                      scene0400_00 scene0590_00 scene0645_00";
-/// Words of the 19 classes, and their NYU40 ids.
-const WORDS: &str = "wall,floor,cabinet,bed,chair,sofa,table,door,window,bookshelf,picture,counter,desk,curtain,\
-                     refrigerator,shower curtain,toilet,sink,bathtub";
-const IDS: [u16; 19] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 24, 28, 33, 34, 36];
+const SCENES: [&str; 10] = [
+    "scene0000_00",
+    "scene0062_00",
+    "scene0070_00",
+    "scene0097_00",
+    "scene0140_00",
+    "scene0200_00",
+    "scene0347_00",
+    "scene0400_00",
+    "scene0590_00",
+    "scene0645_00",
+];
+/// NYU40 ids and words of the 19 classes.
+const CLASSES: [(u16, &str); 19] = [
+    (1, "wall"),
+    (2, "floor"),
+    (3, "cabinet"),
+    (4, "bed"),
+    (5, "chair"),
+    (6, "sofa"),
+    (7, "table"),
+    (8, "door"),
+    (9, "window"),
+    (10, "bookshelf"),
+    (11, "picture"),
+    (12, "counter"),
+    (14, "desk"),
+    (16, "curtain"),
+    (24, "refrigerator"),
+    (28, "shower curtain"),
+    (33, "toilet"),
+    (34, "sink"),
+    (36, "bathtub"),
+];
 const IDS_OF_15: [u16; 15] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 33, 34];
 const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
 /// More transparent Gaussians are ignored.
@@ -67,14 +96,6 @@ pub(crate) struct ScannetArgs {
     /// take its most frequent class.
     #[arg(long)]
     segments: bool,
-}
-
-/// Means over a list of classes.
-#[derive(Clone, Debug, Serialize)]
-pub(super) struct Subset {
-    pub(super) n_classes: usize,
-    pub(super) miou: Option<f64>,
-    pub(super) macc: Option<f64>,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -133,7 +154,7 @@ pub(super) fn judge(
     check_scene(reader, scene.len())?;
     let nearest = nearest_gaussians(scan, scene);
     let (mut unknown_words, mut scores) = (BTreeMap::new(), Vec::new());
-    for word in WORDS.split(',') {
+    for (_, word) in CLASSES {
         scores.push(match encoder.encode(word) {
             Ok(vector) => query::scores(reader, &vector)?.cosines,
             Err(error) => {
@@ -142,17 +163,19 @@ pub(super) fn judge(
             }
         });
     }
-    if unknown_words.len() == IDS.len() {
-        bail!("the encoder knows none of the {} words: {unknown_words:?}", IDS.len());
+    if unknown_words.len() == CLASSES.len() {
+        bail!("the encoder knows none of the {} words: {unknown_words:?}", CLASSES.len());
     }
     let answers = Answers { scan, nearest: &nearest, scores: &scores };
     let segments = if with_segments { Some(scan.segments()?) } else { None };
     let subsets = |segments: Option<&[u32]>| {
-        [&IDS[..], &IDS_OF_15, &IDS_OF_10].map(|ids| answers.subset(ids, segments)).to_vec()
+        let ids_of_19 = CLASSES.map(|(id, _)| id);
+        [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| answers.subset(ids, segments)).to_vec()
     };
-    let judged = scan.labels.iter().zip(&nearest).filter(|(label, _)| IDS.contains(label));
+    let is_judged = |label: &u16| CLASSES.iter().any(|(id, _)| id == label);
+    let judged = scan.labels.iter().zip(&nearest).filter(|(label, _)| is_judged(label));
     let judged: Vec<Option<usize>> = judged.map(|(_, nearest)| *nearest).collect();
-    let all: Vec<usize> = (0..IDS.len()).collect();
+    let all: Vec<usize> = (0..CLASSES.len()).collect();
     Ok(ScanReport {
         scene: scan.name.clone(),
         subsets: subsets(None),
@@ -184,15 +207,16 @@ impl Answers<'_> {
 
     /// Compares answers with labels; means are over the classes in the scene, as in the protocol.
     fn subset(&self, ids: &[u16], segments: Option<&[u32]>) -> Subset {
-        let classes: Vec<usize> = (0..IDS.len()).filter(|class| ids.contains(&IDS[*class])).collect();
+        let classes: Vec<usize> =
+            (0..CLASSES.len()).filter(|class| ids.contains(&CLASSES[*class].0)).collect();
         let mut answers: Vec<Option<usize>> =
             self.nearest.iter().map(|gaussian| self.best(*gaussian, &classes)).collect();
         if let Some(segments) = segments {
             vote(&mut answers, segments);
         }
-        let mut confusion = Confusion::new(IDS.len());
+        let mut confusion = Confusion::new(CLASSES.len());
         for (label, answer) in self.scan.labels.iter().zip(answers) {
-            if let Some(truth) = classes.iter().copied().find(|class| IDS[*class] == *label) {
+            if let Some(truth) = classes.iter().copied().find(|class| CLASSES[*class].0 == *label) {
                 confusion.count(truth, answer);
             }
         }
@@ -209,7 +233,7 @@ impl Answers<'_> {
 /// The paper's prediction filter: all vertices of a segment take the class that most of its vertices with an answer
 /// have, ties going to the first of the list. Vertices without a label vote, too.
 fn vote(answers: &mut [Option<usize>], segments: &[u32]) {
-    let mut votes: HashMap<u32, [u32; IDS.len()]> = HashMap::new();
+    let mut votes: HashMap<u32, [u32; CLASSES.len()]> = HashMap::new();
     for (segment, answer) in segments.iter().zip(&*answers) {
         if let Some(class) = answer {
             votes.entry(*segment).or_default()[*class] += 1;
@@ -251,7 +275,7 @@ impl ScannetReport {
         let means_of = |subsets: &dyn Fn(&ScanReport) -> Option<Vec<Subset>>| -> Option<Vec<Subset>> {
             let of_scenes: Vec<Vec<Subset>> = scenes.iter().map(subsets).collect::<Option<_>>()?;
             let mean_of = |at: usize| Subset {
-                n_classes: [IDS.len(), IDS_OF_15.len(), IDS_OF_10.len()][at],
+                n_classes: [CLASSES.len(), IDS_OF_15.len(), IDS_OF_10.len()][at],
                 miou: mean(of_scenes.iter().map(|subsets| subsets[at].miou)),
                 macc: mean(of_scenes.iter().map(|subsets| subsets[at].macc)),
             };
@@ -260,7 +284,7 @@ impl ScannetReport {
         let means = means_of(&|scene| Some(scene.subsets.clone())).unwrap_or_default();
         let filtered_means = means_of(&|scene| scene.filtered.clone());
         let missing_scenes =
-            SCENES.split(' ').filter(|name| !scenes.iter().any(|s| s.scene == *name)).collect();
+            SCENES.into_iter().filter(|name| !scenes.iter().any(|s| s.scene == *name)).collect();
         Self { scenes, means, filtered_means, missing_scenes }
     }
 
@@ -330,8 +354,11 @@ impl Scan {
         let path = dir.join(format!("{name}_vh_clean_2.labels.ply"));
         let rows = read_vertices(&path, ["x", "y", "z", "label"])?;
         if let Some(row) = rows.iter().find(|row| !(0.0..=f64::from(MAX_ID)).contains(&row[3])) {
-            let (path, label) = (path.display(), row[3]);
-            bail!("{path}: label {label}, expected 0 to {MAX_ID} (NYU40); use the file of the v2 release");
+            let label = row[3];
+            bail!(
+                "{}: label {label}, expected 0 to {MAX_ID} (NYU40); use the file of the v2 release",
+                path.display()
+            );
         }
         let (vertices, labels) = rows.iter().map(|[x, y, z, label]| ([*x, *y, *z], *label as u16)).unzip();
         Ok(Self { name, dir: dir.to_owned(), vertices, labels })
@@ -344,8 +371,10 @@ impl Scan {
         let segments: Segments = serde_json::from_slice(&fs_err::read(&path)?).with_context(expected)?;
         let (n, n_vertices) = (segments.of_vertex.len(), self.vertices.len());
         if n != n_vertices {
-            let (path, advice) = (path.display(), "use both files of one release");
-            bail!("{path}: {n} segments, expected one for each of {n_vertices} vertices; {advice}");
+            bail!(
+                "{}: {n} segments, expected one for each of {n_vertices} vertices; use both files of one release",
+                path.display()
+            );
         }
         Ok(segments.of_vertex)
     }

@@ -16,35 +16,18 @@ use super::run::{MaskSource, Runner, ScenesArgs, truth_of};
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure};
 
-/// Figures of a scene, or means over all.
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     scene: String,
-    photos: Figures,
-    drawn: Figures,
-}
-
-#[derive(Clone, Copy, Debug, Serialize)]
-struct Figures {
-    n_views: Option<f64>,
-    ap: Option<f64>,
-    miou: Option<f64>,
+    n_views: f64,
+    ap_photos: Option<f64>,
+    ap_drawn: Option<f64>,
+    miou_photos: Option<f64>,
+    miou_drawn: Option<f64>,
     /// Things found at IoU 0.5 by any object.
-    found: Option<f64>,
+    found_photos: Option<f64>,
+    found_drawn: Option<f64>,
     n_things: Option<f64>,
-}
-
-impl Figures {
-    fn mean(all: &[Self]) -> Self {
-        let of = |figure: fn(&Self) -> Option<f64>| mean(all.iter().map(figure));
-        Self {
-            n_views: of(|f| f.n_views),
-            ap: of(|f| f.ap),
-            miou: of(|f| f.miou),
-            found: of(|f| f.found),
-            n_things: of(|f| f.n_things),
-        }
-    }
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -54,41 +37,69 @@ pub(crate) struct SplatOnlyReport {
     mean: Row,
 }
 
+struct Figures {
+    n_views: usize,
+    ap: Option<f64>,
+    miou: Option<f64>,
+    found: Option<f64>,
+    n_things: Option<f64>,
+}
+
 pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<SplatOnlyReport> {
     let runner = Runner::open(args)?;
     let mut text = runner.text_encoder()?;
-    let files = SceneFiles::find_all(&args.scene)?;
-    progress.begin("splat only", "encode", 2 * files.len() as u64, 0);
-    let mut scenes = Vec::new();
-    for files in &files {
+    let scenes = SceneFiles::find_all(&args.scene)?;
+    progress.begin("splat only", "encode", 2 * scenes.len() as u64, 0);
+    let mut rows = Vec::new();
+    for files in &scenes {
         let drawn_at = args.out.join(&files.name).join("drawn").join(POSES_FILE);
-        let (n_views, drawn) = figures(&runner, files, "drawings", &mut *text, |settings| {
+        let drawn = figures(&runner, files, "drawings", &mut *text, |settings| {
             settings.inputs.images = None;
             settings.inputs.views = drawn_at;
             settings.inputs.planned = Some(ViewpointSettings { n_views: DEFAULT_N_VIEWS, up: None });
         })?;
         progress.advance(1);
-        let (_, photos) = figures(&runner, files, "photos", &mut *text, |settings| {
-            settings.run.views_limit = ViewsLimit::Count(n_views);
+        let photos = figures(&runner, files, "photos", &mut *text, |settings| {
+            settings.run.views_limit = ViewsLimit::Count(drawn.n_views);
             settings.run.view_order = ViewOrder::Coverage;
         })?;
         progress.advance(1);
-        scenes.push(Row { scene: files.name.clone(), photos, drawn });
+        rows.push(Row {
+            scene: files.name.clone(),
+            n_views: drawn.n_views as f64,
+            ap_photos: photos.ap,
+            ap_drawn: drawn.ap,
+            miou_photos: photos.miou,
+            miou_drawn: drawn.miou,
+            found_photos: photos.found,
+            found_drawn: drawn.found,
+            n_things: drawn.n_things,
+        });
     }
     progress.end();
-    let of = |side: fn(&Row) -> Figures| Figures::mean(&scenes.iter().map(side).collect::<Vec<_>>());
-    let mean = Row { scene: "mean".into(), photos: of(|row| row.photos), drawn: of(|row| row.drawn) };
-    Ok(SplatOnlyReport { encoder: runner.encoder_id(), scenes, mean })
+    let of = |figure: fn(&Row) -> Option<f64>| mean(rows.iter().map(figure));
+    let mean = Row {
+        scene: "mean".into(),
+        n_views: of(|row| Some(row.n_views)).unwrap_or_default(),
+        ap_photos: of(|row| row.ap_photos),
+        ap_drawn: of(|row| row.ap_drawn),
+        miou_photos: of(|row| row.miou_photos),
+        miou_drawn: of(|row| row.miou_drawn),
+        found_photos: of(|row| row.found_photos),
+        found_drawn: of(|row| row.found_drawn),
+        n_things: of(|row| row.n_things),
+    };
+    Ok(SplatOnlyReport { encoder: runner.encoder_id(), scenes: rows, mean })
 }
 
-/// Encodes a scene and judges it, by Gaussian; things are found by objects. Returns the number of views, too.
+/// Encodes a scene and judges it, by Gaussian; things are found by objects.
 fn figures(
     runner: &Runner,
     files: &SceneFiles,
     method: &str,
     text: &mut dyn TextEncoder,
     change: impl FnOnce(&mut EncodeSettings),
-) -> Result<(usize, Figures)> {
+) -> Result<Figures> {
     let encoded = runner.encode(files, MaskSource::Automatic, method, |settings| {
         settings.cells.shards.profiles = vec![Profile::Exact];
         change(settings);
@@ -100,28 +111,27 @@ fn figures(
         judge(&encoded.reader, &truth, text, &settings)
     };
     let (of_gaussians, of_objects) = (by(EvalKind::Gaussians)?, by(EvalKind::Objects)?);
-    let any = of_objects.instances;
-    let n_views = encoded.summary.n_views;
-    let figures = Figures {
-        n_views: Some(n_views as f64),
-        ap: of_gaussians.mean_average_precision,
-        miou: of_gaussians.miou,
+    let any = of_objects.instances.map(|instances| instances.any);
+    let ap = of_gaussians.mean_average_precision;
+    tracing::info!("{} {method}: AP {ap:.4?}, found {any:?}, {:.0} s", files.name, encoded.secs);
+    Ok(Figures {
+        n_views: encoded.summary.n_views,
+        ap,
+        miou: of_gaussians.multi_class.first().and_then(|all| all.miou),
         found: any.map(|any| any.n_at_50 as f64),
         n_things: any.map(|any| any.n as f64),
-    };
-    tracing::info!("{} {method}: {figures:?}, {:.0} s", files.name, encoded.secs);
-    Ok((n_views, figures))
+    })
 }
 
 impl fmt::Display for SplatOnlyReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let pairs = ["AP, photos", "drawings", "mIoU, photos", "drawings", "found, photos", "drawings", "of"];
         let mut table = Table::new(["scene", "views"].into_iter().chain(pairs));
-        for Row { scene, photos, drawn } in self.scenes.iter().chain([&self.mean]) {
+        for row in self.scenes.iter().chain([&self.mean]) {
             let count = |n: Option<f64>| n.map_or("-".into(), |n| format!("{n:.0}"));
-            let mut cells = vec![scene.clone(), count(drawn.n_views)];
-            cells.extend([photos.ap, drawn.ap, photos.miou, drawn.miou].map(figure));
-            cells.extend([photos.found, drawn.found, drawn.n_things].map(count));
+            let mut cells = vec![row.scene.clone(), count(Some(row.n_views))];
+            cells.extend([row.ap_photos, row.ap_drawn, row.miou_photos, row.miou_drawn].map(figure));
+            cells.extend([row.found_photos, row.found_drawn, row.n_things].map(count));
             table.row(cells);
         }
         write!(f, "{table}")

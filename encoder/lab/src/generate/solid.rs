@@ -116,6 +116,19 @@ impl Shape {
         }
     }
 
+    /// Surface included.
+    #[cfg(any(test, feature = "measure"))]
+    pub fn contains(self, p: DVec3) -> bool {
+        match self {
+            Self::Box(half) => p.abs().cmple(half).all(),
+            Self::Ellipsoid(half) => (p / half).length_squared() <= 1.0,
+            Self::Cone { radii_m: [below, above], half_height_m } => {
+                let radius_m = below + (above - below) * (p.z / half_height_m + 1.0) / 2.0;
+                p.z.abs() <= half_height_m && p.x.hypot(p.y) <= radius_m
+            }
+        }
+    }
+
     fn surfels(self, spacing_m: f64) -> Vec<Surfel> {
         let mut out = Vec::new();
         match self {
@@ -240,7 +253,7 @@ mod tests {
         for (shape, area) in SHAPES.into_iter().zip(areas) {
             let surfels = shape.surfels(spacing_m);
             for s in &surfels {
-                assert!(outside(shape, s.position * 0.999) < 0.0, "{shape:?} {s:?}");
+                assert!(shape.contains(s.position * 0.999) && !shape.contains(s.position + 1e-4 * s.normal));
                 assert!(outside(shape, s.position).abs() < 1e-9, "{shape:?} {s:?}");
                 assert!((s.normal.length() - 1.0).abs() < 1e-9);
                 assert!(outside(shape, s.position + 1e-4 * s.normal) > 0.0, "{shape:?} {s:?}");
