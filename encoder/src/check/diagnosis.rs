@@ -130,7 +130,14 @@ impl Samples {
             flat_psnr_db: mean(samples.iter().map(|view| view.flat_psnr_db())),
             given_psnr_db,
             pairs_left: Cell::new(n_pairs.saturating_mul(1000).saturating_add(MAX_PAIRS)),
-            suspected: options.suspicions.iter().filter_map(|suspicion| suspicion.mistake).collect(),
+            plain_psnr_db: Cell::new(f64::NEG_INFINITY),
+            suspected: options
+                .suspicions
+                .iter()
+                .filter_map(|suspicion| suspicion.mistake)
+                .flat_map(|mistake| [Some(mistake), mistake.alternative()])
+                .flatten()
+                .collect(),
         };
         let tried = search.run(&options.frames, means.fit())?;
         let best = tried.first().filter(|best| search.explains(best));
@@ -182,17 +189,21 @@ struct Search<'a> {
     rasterizer: &'a dyn Rasterizer,
     flat_psnr_db: f64,
     given_psnr_db: f64,
+    /// The same of the splat without harmonics, as the corrected splats are.
+    plain_psnr_db: Cell<f64>,
     pairs_left: Cell<usize>,
     suspected: Vec<Mistake>,
 }
 
 impl Search<'_> {
     /// Tries what is suspected and what goes unnoticed; where drawings and photos differ, also common mistakes, frames
-    /// and a sweep of scales, until one explains the photos. Returns all trials, best first; a frame of nerfstudio's
-    /// defaults or a scale among the best is refined.
+    /// and a sweep of scales, until one explains the photos. Returns the best trials, those first that explain them; a
+    /// frame of nerfstudio's defaults or a scale is refined if it is the first.
     fn run(&self, frames: &[FrameCandidate], fit: bool) -> Result<Vec<Trial>, CheckError> {
         let mut tried = Vec::new();
-        self.try_all(self.suspected.iter().copied().chain(Mistake::UNNOTICED), &mut tried)?;
+        let harmonics = (self.scene.sh_degree > 0).then_some(Mistake::Harmonics);
+        let first = self.suspected.iter().copied().chain(harmonics).chain(Mistake::UNNOTICED);
+        self.try_all(first, &mut tried)?;
         if !fit && !tried.iter().any(|trial| self.explains(trial)) {
             let frames = frames.iter().map(|frame| Mistake::Frame(*frame));
             self.try_all(Mistake::common().into_iter().chain(frames), &mut tried)?;
@@ -202,7 +213,7 @@ impl Search<'_> {
             let powers = (-n..=n).filter(|power| *power != 0);
             self.try_all(powers.map(|power| Mistake::SceneScale(SWEEP_STEP.powi(power))), &mut tried)?;
         }
-        tried.sort_by(|a, b| b.psnr_db.total_cmp(&a.psnr_db));
+        tried.sort_by(|a, b| self.explains(b).cmp(&self.explains(a)).then(b.psnr_db.total_cmp(&a.psnr_db)));
         if let Some(first) = tried.first_mut() {
             *first = self.refined(*first)?;
         }
@@ -231,6 +242,9 @@ impl Search<'_> {
             None => mean_psnr_db(self.samples, self.loaded, Some(mistake), FIRST_VIEWS)?,
         };
         self.pairs_left.set(self.pairs_left.get().saturating_sub(n_pairs));
+        if mistake == Mistake::Harmonics {
+            self.plain_psnr_db.set(psnr_db);
+        }
         Ok(Trial { mistake, psnr_db })
     }
 
@@ -240,7 +254,10 @@ impl Search<'_> {
         let is_likely =
             self.suspected.contains(&trial.mistake) || Mistake::UNNOTICED.contains(&trial.mistake);
         let gain_db = if is_likely { SUSPECTED_GAIN_DB } else { CLEAR_GAIN_DB };
-        trial.psnr_db > (self.given_psnr_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
+        let is_plain = trial.mistake.is_of_splat() && trial.mistake != Mistake::Harmonics;
+        let plain_db = if is_plain { self.plain_psnr_db.get() } else { f64::NEG_INFINITY };
+        let uncorrected_db = self.given_psnr_db.max(plain_db);
+        trial.psnr_db > (uncorrected_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
     }
 
     /// Refines a focal length, or a similarity that is swept or computed from other data than the trainer's (pattern

@@ -18,6 +18,14 @@ pub enum Mistake {
     /// Both, as in a NeRF `transforms.json`.
     #[error("the poses are world-from-camera with OpenGL axes; invert them, then negate the y and z rows")]
     WorldFromOpenGlCamera,
+    /// The matrices of a `transforms.json` are camera-from-world, with OpenCV axes.
+    #[error(
+        "the matrices of transforms.json are camera-from-world with OpenCV axes; invert them, then negate the y and z columns"
+    )]
+    CameraFromWorld,
+    /// The same with OpenGL axes.
+    #[error("the matrices of transforms.json are camera-from-world; invert them")]
+    OpenGlCameraFromWorld,
     /// The photos are turned by 180 degrees against their cameras.
     #[error(
         "the photos are stored upside down against their cameras, perhaps with an EXIF orientation; turn their pixels \
@@ -35,6 +43,12 @@ pub enum Mistake {
         "the intrinsics belong to photos {0:.3} times as large; divide focal lengths and principal point by {0:.3}"
     )]
     IntrinsicsOfSize(f64),
+    /// The centre alone is that of photos this many times as large.
+    #[error(
+        "the principal point belongs to photos {0:.3} times as large, the focal lengths do not; divide the principal point \
+         by {0:.3}"
+    )]
+    CentreOfSize(f64),
     /// The principal point is at 0 instead of the middle.
     #[error("the principal point is at 0; set it to half the width and half the height")]
     CentreAtZero,
@@ -71,6 +85,12 @@ pub enum Mistake {
     /// The splat's rotations turn the other way.
     #[error("the splat's rotations are inverted, world to Gaussian; convert it again")]
     RotationsInverted,
+    /// The splat's harmonics above degree 0.
+    #[error(
+        "the splat's harmonics (f_rest) are wrong, and it fits better without them; export it again (encode with photos does \
+         not use them)"
+    )]
+    Harmonics,
     /// The splat has scales instead of their logarithms, or opacities instead of logits.
     #[error("the splat file has {}", match (scales, opacities) {
         (true, false) => "scales instead of their logarithms; use --activated scales",
@@ -122,13 +142,27 @@ impl Mistake {
 
     /// Mistakes to try where drawings and photos differ, beside frames.
     pub(super) fn common() -> Vec<Self> {
-        let cameras =
-            [Self::OpenGlAxes, Self::WorldFromCamera, Self::WorldFromOpenGlCamera, Self::UpsideDown];
+        let cameras = [
+            Self::OpenGlAxes,
+            Self::WorldFromCamera,
+            Self::WorldFromOpenGlCamera,
+            Self::CameraFromWorld,
+            Self::OpenGlCameraFromWorld,
+            Self::UpsideDown,
+        ];
         let focals = FOCAL_SCALES.map(Self::FocalScale);
         let scales = [0.01, 0.1, 10.0, 100.0].map(Self::SceneScale);
         let axes = right_angles().into_iter().map(Self::WorldAxes);
         let mirrored = (0..3).map(Self::Mirrored);
         cameras.into_iter().chain(focals).chain(scales).chain(axes).chain(mirrored).collect()
+    }
+
+    /// What explains the same data as well.
+    pub(super) fn alternative(self) -> Option<Self> {
+        match self {
+            Self::IntrinsicsOfSize(factor) => Some(Self::CentreOfSize(factor)),
+            _ => None,
+        }
     }
 
     /// Returns the similarity from the world of the poses to that of the splat; `None` for other mistakes.
@@ -149,6 +183,10 @@ impl Mistake {
             Self::OpenGlAxes => *pose = turned(1.0, -1.0, -1.0) * *pose,
             Self::WorldFromCamera => *pose = pose.inverse(),
             Self::WorldFromOpenGlCamera => *pose = turned(1.0, -1.0, -1.0) * pose.inverse(),
+            Self::CameraFromWorld => *pose = pose.inverse() * turned(1.0, -1.0, -1.0),
+            Self::OpenGlCameraFromWorld => {
+                *pose = turned(1.0, -1.0, -1.0) * pose.inverse() * turned(1.0, -1.0, -1.0);
+            }
             Self::UpsideDown => {
                 *pose = turned(-1.0, -1.0, 1.0) * *pose;
                 camera.centre_x_px = f64::from(camera.width_px) - camera.centre_x_px;
@@ -161,6 +199,10 @@ impl Mistake {
             Self::IntrinsicsOfSize(factor) => {
                 camera.focal_x_px /= factor;
                 camera.focal_y_px /= factor;
+                camera.centre_x_px /= factor;
+                camera.centre_y_px /= factor;
+            }
+            Self::CentreOfSize(factor) => {
                 camera.centre_x_px /= factor;
                 camera.centre_y_px /= factor;
             }
@@ -185,20 +227,23 @@ impl Mistake {
         corrected
     }
 
+    pub(super) fn is_of_splat(self) -> bool {
+        use Mistake::{Activated, Harmonics, Mirrored, RotationsInverted, RotationsXyzw};
+        matches!(self, Mirrored(_) | RotationsXyzw | RotationsInverted | Harmonics | Activated { .. })
+    }
+
     /// The splat with the mistake corrected, with colours of degree 0; `None` for mistakes of other inputs.
     pub(crate) fn corrected_splat(self, scene: &Gaussians) -> Option<Gaussians> {
-        let mut corrected = match self {
-            Self::Mirrored(_) | Self::RotationsXyzw | Self::RotationsInverted | Self::Activated { .. } => {
-                Gaussians {
-                    means_in_world: scene.means_in_world.clone(),
-                    rotations_wxyz: scene.rotations_wxyz.clone(),
-                    scales: scene.scales.clone(),
-                    opacities: scene.opacities.clone(),
-                    sh_dc: scene.sh_dc.clone(),
-                    ..Gaussians::default()
-                }
-            }
-            _ => return None,
+        if !self.is_of_splat() {
+            return None;
+        }
+        let mut corrected = Gaussians {
+            means_in_world: scene.means_in_world.clone(),
+            rotations_wxyz: scene.rotations_wxyz.clone(),
+            scales: scene.scales.clone(),
+            opacities: scene.opacities.clone(),
+            sh_dc: scene.sh_dc.clone(),
+            ..Gaussians::default()
         };
         match self {
             Self::Mirrored(axis) => {

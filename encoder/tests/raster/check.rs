@@ -93,6 +93,17 @@ fn planted_mistakes_are_diagnosed() {
     };
     assert_eq!(diagnosed(&scene, &nerf), Some(Mistake::WorldFromOpenGlCamera));
 
+    let camera_from_world = |view: &mut RasterView| {
+        invert(view);
+        negate_yz(view);
+    };
+    assert_eq!(diagnosed(&scene, &camera_from_world), Some(Mistake::CameraFromWorld));
+    let opengl = |view: &mut RasterView| {
+        negate_yz(view);
+        camera_from_world(view);
+    };
+    assert_eq!(diagnosed(&scene, &opengl), Some(Mistake::OpenGlCameraFromWorld));
+
     let mut large = scene.clone();
     large.means_in_world.iter_mut().for_each(|mean| *mean *= 10.0);
     large.scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s * 10.0));
@@ -139,6 +150,12 @@ fn planted_mistakes_are_diagnosed() {
     assert_eq!(diagnosed(&turned, &|_| {}), Some(Mistake::RotationsXyzw));
     turned.rotations_wxyz = scene.rotations_wxyz.iter().map(|[w, x, y, z]| [*w, -x, -y, -z]).collect();
     assert_eq!(diagnosed(&turned, &|_| {}), Some(Mistake::RotationsInverted));
+
+    // Noise in place of harmonics does not turn the Gaussians.
+    let mut noisy = scene.clone();
+    noisy.sh_degree = 1;
+    noisy.sh_rest = (0..9 * scene.len()).map(|i| (i * 7919 % 101) as f32 / 50.0 - 1.0).collect();
+    assert_eq!(diagnosed(&noisy, &|_| {}), Some(Mistake::Harmonics));
 
     let other_way = |view: &mut RasterView| {
         let pose = &mut view.camera_from_world;
@@ -258,6 +275,11 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
         camera.centre_y_px *= 1.5;
     });
     assert!(matches!(larger, Some(Mistake::IntrinsicsOfSize(f)) if (f - 1.5).abs() < 0.02), "{larger:?}");
+    let centre = with_camera(&|camera| {
+        camera.centre_x_px *= 2.0;
+        camera.centre_y_px *= 2.0;
+    });
+    assert!(matches!(centre, Some(Mistake::CentreOfSize(f)) if (f - 2.0).abs() < 0.02), "{centre:?}");
     let at_zero = with_camera(&|camera| (camera.centre_x_px, camera.centre_y_px) = (0.0, 0.0));
     assert_eq!(at_zero, Some(Mistake::CentreAtZero));
     assert_eq!(with_camera(&|camera| camera.centre_x_px = 0.0), Some(Mistake::CentreAtZero));
