@@ -181,8 +181,10 @@ fn sizes_that_are_a_scale_bring_the_camera_along() {
     assert!(load(81, 61, "png", odd).is_ok(), "halved and rounded up");
     for (width, height) in [(160, 121), (159, 120), (120, 160), (81, 60), (80, 59), (1440, 1080)] {
         match load(width, height, "png", camera(Distortion::None)) {
-            Err(IngestError::Size { found_px, expected_px, .. }) => {
+            Err(error @ IngestError::Size { found_px, expected_px, .. }) => {
                 assert_eq!((found_px, expected_px), ([width, height], [160, 120]));
+                let is_swapped = (width, height) == (120, 160);
+                assert_eq!(error.to_string().contains("sides swapped; swap"), is_swapped, "{error}");
             }
             other => panic!("{width} x {height}: {:?}", other.map(|loaded| loaded.view)),
         }

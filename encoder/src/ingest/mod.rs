@@ -89,11 +89,22 @@ pub enum IngestError {
     #[error("{}: {problem}", path.display())]
     File { path: PathBuf, problem: String },
     #[error(
-        "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other, 1/{MAX_DOWNSCALE} to {MAX_UPSCALE}; \
-         give the images that the poses were computed from, or whole-factor reductions of them",
-        path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1]
+        "{}: the image is {} x {} px but its camera {} x {} px, and {}",
+        path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1], size_advice(*found_px, *expected_px)
     )]
     Size { path: PathBuf, found_px: [u32; 2], expected_px: [u32; 2] },
+}
+
+fn size_advice(found_px: [u32; 2], expected_px: [u32; 2]) -> String {
+    let area_px = |i: usize| u64::from(found_px[i]) * u64::from(expected_px[i]);
+    if area_px(0) == area_px(1) {
+        return "these are its sides swapped; swap the camera's width and height, or give photos that are not turned"
+            .into();
+    }
+    format!(
+        "the one is no uniform scale of the other, 1/{MAX_DOWNSCALE} to {MAX_UPSCALE}; give the images that the poses \
+         were computed from, or whole-factor reductions of them"
+    )
 }
 
 #[derive(Deserialize)]
