@@ -14,6 +14,7 @@ use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameC
 use crate::ingest::{self, FoundFrame, IngestError, OddPhotos};
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
+use crate::raster::{RasterView, check_near_plane};
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder check --scene splat.ply --views sparse/0 --out look/\n\
@@ -96,6 +97,7 @@ fn checked(args: &CheckArgs) -> Result<(CheckReport, bool)> {
         }
     }
     let (n_views, suspicions) = (views.len(), check::suspicions(&scene, &views));
+    check_near_plane(&scene, &views.iter().map(RasterView::of).collect::<Vec<_>>())?;
     let views = with_photos(views, input.strict, &mut notes)?;
     let is_partial = n_left_out > 0 || views.len() < n_views;
     let n = (args.samples as usize).min(views.len());

@@ -15,7 +15,7 @@ use super::memory::default_memory_bytes;
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
-use crate::raster::{RasterView, Rasterizer};
+use crate::raster::{RasterView, Rasterizer, check_near_plane};
 use crate::viewpoints::{self, DEFAULT_N_VIEWS, DrawnView, ViewpointSettings};
 
 const PLAN_EXAMPLES: &str = "Examples:\n\
@@ -118,6 +118,7 @@ pub(super) fn draw(args: &DrawArgs, progress: &dyn Progress, json: bool) -> Resu
         return Err(anyhow!("two views would be drawn into {}; rename one of them", twice.name));
     }
     let out = &args.drawing.out;
+    check_near_plane(&scene, &views.iter().map(|view| view.view).collect::<Vec<_>>())?;
     let scene = devices.load(&scene)?;
     viewpoints::draw(out, &mut views, scene.as_ref(), &name, args.depth, progress)?;
     let poses = out.join(viewpoints::POSES_FILE);

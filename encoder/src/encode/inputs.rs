@@ -19,6 +19,7 @@ use super::settings::{EncodeSettings, InputSettings, MAX_RASTER_WIDTH_PX, ViewSe
 use crate::cells::{self, CellSplit, PositionError};
 use crate::ground::Standing;
 use crate::memory::{MemoryPlan, Phase};
+use crate::raster::{RasterView, check_near_plane};
 use crate::segment::Segmenter;
 use crate::store::remove_files;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
@@ -71,6 +72,7 @@ impl Inputs {
         context.install(|| check::suspicions(&scene, &views)).iter().for_each(|suspicion| {
             tracing::warn!("{}; `slag-encoder check` tells more", suspicion.text);
         });
+        check_near_plane(&scene, &views.iter().map(RasterView::of).collect::<Vec<_>>())?;
         let limits = settings.cells.limits;
         check_cells(scene.len().div_ceil(limits.max_gaussians))?;
         let split = context.time("cells", || context.install(|| cells::split(&scene, limits)));

@@ -10,15 +10,18 @@ pub mod gpu;
 #[cfg(not(feature = "gpu"))]
 #[path = "no_gpu.rs"]
 pub mod gpu;
+mod near;
 
 use serde::Serialize;
 use slag_common::Gaussians;
 use slag_raster::ViewCounters;
+use slag_raster::constants::NEAR_Z;
 
 use crate::masks::RegionMap;
 
 pub use cpu::CpuRasterizer;
 pub(crate) use cpu::reserve;
+pub(crate) use near::check_near_plane;
 pub use slag_raster::{Drawing, InputError, RasterView, constants, pinhole};
 
 pub trait Rasterizer: Send + Sync {
@@ -85,6 +88,12 @@ pub enum RasterError {
         "pixel {pixel} has region {found}, but the map has {n_regions} regions; create the region map again"
     )]
     Region { pixel: usize, found: u32, n_regions: u32 },
+    #[error(
+        "the Gaussians before the cameras are {depth:.1e} units away (median), and {:.0} % nearer than {NEAR_Z}, where none \
+         is drawn; multiply the positions of poses and splat, and the splat's scales, by {factor}",
+        cut_share * 100.0
+    )]
+    NearPlane { depth: f64, cut_share: f64, factor: f64 },
 }
 
 /// A Gaussian's contribution to a region: `alpha * T`, its part of a pixel attenuated by the Gaussians in front, summed

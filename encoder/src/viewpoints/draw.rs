@@ -15,7 +15,7 @@ use super::looks::pinhole;
 use super::plan::{Viewpoint, ViewpointPlan};
 use crate::ingest;
 use crate::progress::Progress;
-use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer};
+use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer, check_near_plane};
 
 pub const POSES_FILE: &str = "transforms.json";
 /// Size of drawings, pixels: that of the photos that the segmenter learnt on, enlarged little.
@@ -123,6 +123,7 @@ pub fn draw_sharpened(
     about: Value,
     progress: &dyn Progress,
 ) -> Result<(), DrawError> {
+    check_near_plane(scene, &views.iter().map(|view| view.view).collect::<Vec<_>>())?;
     begin(folder, drawn_from)?;
     let scales = scene.scales.clone();
     scene.scales.iter_mut().flatten().for_each(|scale| *scale *= SQRT_2);
