@@ -358,7 +358,7 @@ fn advice(diagnosis: &Diagnosis, means: &Means) -> Vec<String> {
 }
 
 /// A drawing with this PSNR looks much like its photo.
-const ALIKE_DB: f64 = 25.0;
+pub(super) const ALIKE_DB: f64 = 25.0;
 
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ViewCheck {
@@ -370,13 +370,15 @@ pub struct ViewCheck {
     /// Share of the image that the scene covers (alpha above 0.5).
     pub(crate) covered_share: f64,
     pub(crate) visible_gaussians: usize,
+    /// The drawing is far less like its photo than those of other views.
+    pub(crate) is_far_below: bool,
 }
 
 impl ViewCheck {
     /// Returns whether the drawing looks more like the photo than its mean colour does, or much like it: of a bare wall
-    /// the mean colour is hard to surpass.
+    /// the mean colour is hard to surpass. One far below others does not fit.
     pub fn fits(&self) -> bool {
-        looks_alike(self.psnr_db, self.flat_psnr_db)
+        !self.is_far_below && looks_alike(self.psnr_db, self.flat_psnr_db)
     }
 }
 
@@ -426,6 +428,11 @@ impl fmt::Display for CheckReport {
             writeln!(f, "{line}")?;
         }
         match &self.diagnosis {
+            None if self.mean_psnr_db < ALIKE_DB => writeln!(
+                f,
+                "the drawings match the photos, at less than the {ALIKE_DB} dB of a good splat: a lens model or poses that are \
+                 a little wrong look so, and a short training; --out DIR shows where"
+            ),
             None => writeln!(f, "the drawings match the photos"),
             Some(diagnosis) => {
                 writeln!(f, "the inputs do not fit together")?;

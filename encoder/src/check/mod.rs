@@ -14,7 +14,7 @@ use slag_common::{Gaussians, durable};
 
 use crate::ingest::IngestError;
 use crate::raster::{LoadedScene, Rasterizer};
-use diagnosis::{FLAWLESS_DB, Means, Samples, looks_alike};
+use diagnosis::{ALIKE_DB, FLAWLESS_DB, Means, Samples, looks_alike};
 use view::{PLAIN_DB, at_width, mean, picture, picture_name};
 
 pub(crate) use diagnosis::ViewCheck;
@@ -26,6 +26,9 @@ pub use view::{CheckError, CheckView, psnr_db};
 
 /// Width at which an encode compares views.
 const QUICK_WIDTH_PX: u32 = 240;
+
+/// A view is far below others if its squared error is six times theirs.
+const FAR_BELOW_DB: f64 = 8.0;
 
 /// Draws the views of a scene and compares them with their photos.
 ///
@@ -77,16 +80,15 @@ where
             flat_psnr_db: small.flat_psnr_db(),
             covered_share: mean(drawing.coverage.iter().map(|&alpha| f64::from(u8::from(alpha > 0.5)))),
             visible_gaussians: drawing.counters.visible,
+            is_far_below: false,
         });
         samples.add(index, &view)?;
     }
     if checks.is_empty() {
         return Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) });
     }
+    mark_far_below(&mut checks);
     let means = means_of(&checks);
-    let mut suspicions: Vec<String> =
-        options.suspicions.iter().map(|suspicion| suspicion.text.clone()).collect();
-    suspicions.extend(odd_views(&checks).filter(|_| means.average_fits()));
     let is_suspect = options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some());
     let diagnosis = if means.psnr_db < FLAWLESS_DB || !means.fit() || is_suspect {
         let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;
@@ -95,6 +97,10 @@ where
     } else {
         None
     };
+    let found = diagnosis.as_ref().and_then(|diagnosis| diagnosis.mistake);
+    let mut suspicions: Vec<String> =
+        options.suspicions.iter().filter_map(|suspicion| suspicion.after_drawing(found)).collect();
+    suspicions.extend(odd_views(&checks).filter(|_| means.average_fits()));
     Ok(CheckReport {
         mean_psnr_db: means.psnr_db,
         mean_flat_psnr_db: means.flat_psnr_db,
@@ -133,15 +139,34 @@ fn means_of(checks: &[ViewCheck]) -> Means {
     }
 }
 
+/// Marks the views that are far less like their photos than the others are, with none between: half of the poses or
+/// cameras may be wrong, and the average good. Photos with little on them gain little over a plain colour, but are
+/// drawn well.
+fn mark_far_below(checks: &mut [ViewCheck]) {
+    let gain_db = |check: &ViewCheck| check.psnr_db - check.flat_psnr_db;
+    let mut told: Vec<&ViewCheck> = checks.iter().filter(|c| c.flat_psnr_db < PLAIN_DB).collect();
+    told.sort_by(|a, b| gain_db(b).total_cmp(&gain_db(a)));
+    // A single outstanding view says nothing against the others.
+    let is_split = |(n, pair): (usize, &[&ViewCheck])| {
+        4 * (n + 1) >= told.len() && gain_db(pair[0]) - gain_db(pair[1]) >= FAR_BELOW_DB
+    };
+    let Some(n) = told.windows(2).enumerate().position(is_split) else { return };
+    let least_gain_db = gain_db(told[n]);
+    let least_db = told[..=n].iter().map(|c| c.psnr_db).fold(ALIKE_DB + FAR_BELOW_DB, f64::min);
+    for check in checks {
+        check.is_far_below = gain_db(check) < least_gain_db && check.psnr_db + FAR_BELOW_DB <= least_db;
+    }
+}
+
 fn odd_views(checks: &[ViewCheck]) -> impl Iterator<Item = String> {
     let mut odd = checks.iter().filter(|view| !view.fits());
     let first = odd.next();
     let (n, of) = (1 + odd.count(), checks.len());
     first.into_iter().map(move |first| {
         format!(
-            "{n} of {of} views look less like their photos than a plain colour does, the first is {}: look at the \
-             poses of these photos, or leave them out",
-            first.name
+            "{n} of {of} views look less like their photos than a plain colour does, or far less than the others do, the \
+             first is {} ({:.1} dB): look at the poses and intrinsics of these photos, or leave them out",
+            first.name, first.psnr_db
         )
     })
 }

@@ -30,11 +30,24 @@ const FEW: usize = 10;
 /// Worlds of splat and cameras are apart if their middles are this many of their sizes from each other.
 const APART: f64 = 10.0;
 
+const AGAIN: &str = "export the splat again, or leave out --activated if it is given";
+
 #[derive(Clone, Debug, PartialEq)]
 pub struct Suspicion {
     pub text: String,
     /// The mistake that would explain it, for drawings to confirm.
     pub mistake: Option<Mistake>,
+}
+
+impl Suspicion {
+    /// What is left to say once `found` explains the photos, or nothing does: advice that drawings contradict is not
+    /// given.
+    pub(super) fn after_drawing(&self, found: Option<Mistake>) -> Option<String> {
+        let Some(mistake) = self.mistake else { return Some(self.text.clone()) };
+        let is_found = found.is_some() && [Some(mistake), mistake.alternative()].contains(&found);
+        let looks = self.text.split("; ").next().unwrap_or_default();
+        (!is_found).then(|| format!("suspected, not confirmed by the drawings: {looks}"))
+    }
 }
 
 /// Returns what looks wrong in a splat and the poses of its photos.
@@ -81,8 +94,7 @@ fn undrawable(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
         let n = usable.len();
         found.push(format!("the splat has only {n} Gaussians that can be drawn: is it the whole export?"));
     } else if share(usable, |i| scene.scales[i] == [0.0; 3]) > 0.5 {
-        let advice = "export the splat again, or leave out --activated scales";
-        found.push(format!("most Gaussians are points without a size; {advice}"));
+        found.push(format!("most Gaussians are points without a size; {AGAIN}"));
     } else if usable.iter().all(|i| scene.scales[*i][2] == 0.0) {
         found.push("the Gaussians are flat, as those of 2DGS: their third axis is taken as 0".into());
     }
@@ -92,7 +104,7 @@ fn undrawable(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
         found.push(format!("{n_lost} of {} Gaussians cannot be drawn{advice}", scene.len()));
     }
     if !usable.is_empty() && share(usable, |i| scene.opacities[i] < INVISIBLE) > MOST {
-        found.push("all Gaussians are transparent; export the splat again".into());
+        found.push(format!("all Gaussians are transparent; {AGAIN}"));
     }
     found
 }
@@ -121,14 +133,17 @@ fn share(usable: &[usize], is: impl Fn(usize) -> bool) -> f64 {
 }
 
 /// A scale s read as a logarithm becomes exp(s): above 1, and just above it for most. An opacity of 0 to 1 read as
-/// a logit becomes 0.5 to 0.731.
+/// a logit becomes 0.5 to 0.731. Values of 0, which would leave nothing to see, are not meant so.
 fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
     // Flat Gaussians have no third scale.
     let given = |i: usize| scene.scales[i].iter().filter(|s| **s != 0.0);
     let scale_share =
         |most: f32| share(usable, |i| given(i).count() > 1 && given(i).all(|s| (1.0..=most).contains(s)));
-    let scales = scale_share(f32::INFINITY) > MOST && scale_share(1.5) > 0.5;
-    let opacities = share(usable, |i| (0.5..=ACTIVATED_OPACITY).contains(&scene.opacities[i])) > MOST;
+    let has_size = share(usable, |i| given(i).any(|s| *s > 1.0)) > 0.5;
+    let scales = scale_share(f32::INFINITY) > MOST && scale_share(1.5) > 0.5 && has_size;
+    let is_visible = share(usable, |i| scene.opacities[i] > 0.501) > 0.5;
+    let opacities =
+        is_visible && share(usable, |i| (0.5..=ACTIVATED_OPACITY).contains(&scene.opacities[i])) > MOST;
     (usable.len() >= MANY && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
 }
 
@@ -193,12 +208,23 @@ fn shifted(scene: &Gaussians, views: &[View]) -> Option<FrameCandidate> {
 /// Returns mistakes that the intrinsics of all photos share.
 fn intrinsics(cameras: &[Intrinsics]) -> Vec<Suspicion> {
     let Some(first) = cameras.first() else { return Vec::new() };
-    if let Some(mistake) = mistaken_centre(cameras, first) {
-        return vec![Suspicion { text: mistake.to_string(), mistake: Some(mistake) }];
+    let mistaken = mistaken_centre(cameras, first);
+    let centre = mistaken.map(|mistake| Suspicion {
+        text: match mistake {
+            Mistake::IntrinsicsOfSize(factor) => format!(
+                "the principal point belongs to photos {factor:.3} times as large; divide it by {factor:.3}, and the \
+                 focal lengths too if they are of those photos"
+            ),
+            _ => mistake.to_string(),
+        },
+        mistake: Some(mistake),
+    });
+    if mistaken.is_some_and(|mistake| mistake != Mistake::CentreAtZero) {
+        return centre.into_iter().collect();
     }
     let Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, .. } = *first;
     let mut texts = Vec::new();
-    if cameras.iter().all(|camera| is_off(relative_centre(camera))) {
+    if mistaken.is_none() && cameras.iter().all(|camera| is_off(relative_centre(camera))) {
         texts.push(format!(
             "the principal point ({centre_x_px:.1}, {centre_y_px:.1}) px is far from the middle of photos of {width_px} x \
              {height_px} px: check the intrinsics, and that the photos are not cropped"
@@ -222,7 +248,7 @@ fn intrinsics(cameras: &[Intrinsics]) -> Vec<Suspicion> {
              millimetres nor shares of the image"
         ));
     }
-    texts.into_iter().map(|text| Suspicion { text, mistake: None }).collect()
+    centre.into_iter().chain(texts.into_iter().map(|text| Suspicion { text, mistake: None })).collect()
 }
 
 /// The wider of a pinhole camera's angles.

@@ -6,7 +6,10 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use slag_common::{Similarity, View};
 
 use super::mistake::AlignError;
-use super::{FrameCause, Mistake, Suspicion, ViewCheck, align, means_of, nerfstudio_defaults, suspicions};
+use super::{
+    FrameCause, Mistake, Suspicion, ViewCheck, align, mark_far_below, means_of, nerfstudio_defaults,
+    suspicions,
+};
 use crate::raster::{RasterView, pinhole};
 
 fn view(name: &str, world_from_camera: DAffine3) -> View {
@@ -168,6 +171,7 @@ fn most_views_must_fit() {
         flat_psnr_db,
         covered_share: 1.0,
         visible_gaussians: 1,
+        is_far_below: false,
     };
     let fit = |good: usize, bad: usize, capped: usize| {
         let all = [
@@ -184,6 +188,32 @@ fn most_views_must_fit() {
     assert_eq!(fit(0, 5, 0), (false, false));
     // A bare wall drawn well, and a black photo, whose own colour is exact.
     assert!(checked(31.0, 40.0).fits() && !checked(5.0, f64::INFINITY).fits());
+    // By hand: good and bad ones with nothing between; an even spread; a wall drawn well; a single outstanding view.
+    let far_below = |views: &[(f64, f64)]| {
+        let mut all: Vec<ViewCheck> = views.iter().map(|(db, flat_db)| checked(*db, *flat_db)).collect();
+        mark_far_below(&mut all);
+        all.iter().map(|check| !check.fits()).collect::<Vec<_>>()
+    };
+    assert_eq!(far_below(&[(31.0, 14.0), (15.9, 13.8), (33.0, 14.0)]), [false, true, false]);
+    assert_eq!(far_below(&[(31.0, 14.0), (24.0, 14.0), (18.0, 14.0)]), [false; 3]);
+    assert_eq!(far_below(&[(31.0, 14.0), (38.0, 36.0), (24.0, 22.0)]), [false; 3]);
+    assert_eq!(
+        far_below(&[(36.0, 14.0), (24.0, 14.0), (23.0, 14.0), (23.0, 14.0), (24.0, 14.0)]),
+        [false; 5]
+    );
+}
+
+/// Advice is that of what the drawings confirmed.
+#[test]
+fn what_drawings_do_not_confirm_is_no_advice() {
+    let suspicion = |mistake| Suspicion { text: "the photos are cut; cut them".into(), mistake };
+    let size = Mistake::IntrinsicsOfSize(2.0);
+    assert_eq!(suspicion(None).after_drawing(Some(size)).as_deref(), Some("the photos are cut; cut them"));
+    for found in [size, Mistake::CentreOfSize(2.0)] {
+        assert_eq!(suspicion(Some(size)).after_drawing(Some(found)), None);
+    }
+    let left = suspicion(Some(size)).after_drawing(None);
+    assert_eq!(left.as_deref(), Some("suspected, not confirmed by the drawings: the photos are cut"));
 }
 
 /// Ten Gaussians, where the cameras are.
@@ -235,6 +265,8 @@ fn intrinsics_of_no_camera_are_suspected() {
         let [Suspicion { text, mistake: None }] = &found[..] else { panic!("{words}: {found:?}") };
         assert!(text.contains(words), "{text}");
     }
+    let found = said([1.7; 2], [0.0; 2]);
+    assert!(found.len() == 2 && found[1].text.contains("field of view of 179.4"), "{found:?}");
     // The corrections are those of cameras at any size.
     let camera = slag_common::Intrinsics { centre_x_px: 0.5, centre_y_px: 0.5, ..pinhole([640, 480], 0.87) };
     let small = RasterView { intrinsics: camera.scaled_to(320, 240), camera_from_world: DAffine3::IDENTITY };

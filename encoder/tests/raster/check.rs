@@ -262,7 +262,13 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     // Logarithms read as scales are negative.
     let mut points = scene.clone();
     points.deactivate(true, false);
-    assert!(suspicions(&points, &views(&photos))[0].text.ends_with("leave out --activated scales"));
+    assert!(suspicions(&points, &views(&photos))[0].text.ends_with("leave out --activated if it is given"));
+    // Constants, such as logarithms and logits of 0, leave nothing once undone.
+    let mut constant = scene.clone();
+    constant.scales.fill([1.0; 3]);
+    constant.opacities.fill(0.5);
+    let found = suspicions(&constant, &views(&photos));
+    assert!(found.iter().all(|found| found.mistake.is_none()), "{found:?}");
     let with_camera = |edit: &dyn Fn(&mut Intrinsics)| {
         let mut photos = photos.clone();
         photos.iter_mut().for_each(|photo| edit(&mut photo.view.intrinsics));
