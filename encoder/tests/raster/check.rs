@@ -151,11 +151,9 @@ fn planted_mistakes_are_diagnosed() {
     turned.rotations_wxyz = scene.rotations_wxyz.iter().map(|[w, x, y, z]| [*w, -x, -y, -z]).collect();
     assert_eq!(diagnosed(&turned, &|_| {}), Some(Mistake::RotationsInverted));
 
-    // Noise in place of harmonics does not turn the Gaussians.
-    let mut noisy = scene.clone();
-    noisy.sh_degree = 1;
-    noisy.sh_rest = (0..9 * scene.len()).map(|i| (i * 7919 % 101) as f32 / 50.0 - 1.0).collect();
-    assert_eq!(diagnosed(&noisy, &|_| {}), Some(Mistake::Harmonics));
+    // Wrong harmonics are no turned Gaussians.
+    let tinted = Gaussians { sh_degree: 1, sh_rest: vec![1.0; 9 * scene.len()], ..scene.clone() };
+    assert_eq!(diagnosed(&tinted, &|_| {}), Some(Mistake::Harmonics));
 
     let other_way = |view: &mut RasterView| {
         let pose = &mut view.camera_from_world;
