@@ -6,7 +6,7 @@ use slag_math::stats::{Rank, quantile};
 use slag_raster::RasterView;
 use slag_raster::constants::NEAR_Z;
 
-use super::rasterizer::RasterError;
+use super::RasterError;
 
 /// Share of the Gaussians before cameras that may be nearer than the near plane; ordinary scenes have none there.
 const MOST_CUT: f64 = 0.02;
