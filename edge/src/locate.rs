@@ -154,11 +154,15 @@ pub fn answer(
     Ok(match locate(&map, &photo, renderer) {
         Outcome::Found(found) => Answer::Found(pose(&found)),
         Outcome::Unsure(candidates) => {
-            let reason = match candidates.len() {
-                1 => "too few landmarks agree with the best pose",
-                _ => "poses in several places agree with the photo",
+            let reason = match candidates.as_slice() {
+                [Located { other_focal_px: Some(other), .. }, ..] => format!(
+                    "the landmarks fit a focal length of {other:.0} px better than the stated {:.0} px: is the photo a smaller copy, or zoomed?",
+                    camera.focal_px
+                ),
+                [_] => "too few landmarks agree with the best pose".into(),
+                _ => "poses in several places agree with the photo".into(),
             };
-            Answer::Unsure { reason: reason.into(), candidates: candidates.iter().map(pose).collect() }
+            Answer::Unsure { reason, candidates: candidates.iter().map(pose).collect() }
         }
         Outcome::Lost(reason) => Answer::Lost { reason: reason.to_string() },
     })

@@ -1,5 +1,7 @@
 //! From a photo to the pose of its camera, or the reason why there is none.
 
+use std::cell::OnceCell;
+
 use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
 
@@ -7,8 +9,8 @@ use crate::features::{Feature, MAX_FEATURES, features};
 use crate::grey::Grey;
 use crate::map::{Map, code};
 use crate::matching::Query;
-use crate::pose::{Match, Pinhole, covariance};
-use crate::ransac::{Agreed, INLIER_PX, locally_refined, ransac};
+use crate::pose::{FOCAL_SIGMA, Match, POSE, POSE_AND_FOCAL, Pinhole, covariance, focal_sigma, refine};
+use crate::ransac::{Agreed, INLIER_PX, MAX_SAMPLES, SOFT_PX, locally_refined, ransac, samples};
 use crate::render::{Compared, Renderer};
 
 const MIN_FEATURES: usize = 20;
@@ -37,6 +39,16 @@ const MIN_PROPOSED_INLIERS: usize = 5;
 const MIN_SPREAD: f64 = 0.04;
 /// Largest angle between stated direction of gravity and that of the pose: 10 degrees.
 const MAX_GRAVITY_ANGLE: f64 = 0.175;
+
+/// Other focal lengths tried, each this many times the one before, up to twice and half the stated one.
+const ZOOM_STEP: f64 = 1.1;
+const N_ZOOMS: i32 = 8;
+/// Most samples for each.
+const MAX_ZOOM_SAMPLES: usize = 1000;
+/// Rounds of freeing the focal length and matching again.
+const FREEING_ROUNDS: usize = 4;
+/// Standard deviations by which the landmarks may contradict the stated focal length.
+const FOCAL_SIGMAS: f64 = 3.0;
 
 /// A photo with its camera; gravity and a prior where they are known.
 #[derive(Clone, Copy, Debug)]
@@ -77,6 +89,8 @@ pub struct Located {
     pub n_inliers: usize,
     /// Whether a rendering at the pose matches the photo.
     pub is_verified: bool,
+    /// Focal length of the pose where the landmarks contradict the stated one, pixels.
+    pub other_focal_px: Option<f64>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -144,7 +158,9 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     let at = found.iter().map(|feature| ideal(photo.intrinsics, feature)).collect();
     let query = Query { at, codes: found.iter().map(|feature| code(&feature.descriptor)).collect() };
     let size_px = DVec2::new(f64::from(photo.intrinsics.width_px), f64::from(photo.intrinsics.height_px));
-    let search = Search { map, photo, query, camera: Pinhole::new(photo.intrinsics), size_px };
+    let all = query.match_all(map);
+    let camera = Pinhole::new(photo.intrinsics);
+    let search = Search { map, photo, query, all, camera, size_px, zoomed: OnceCell::new() };
     let mut proposals = search.proposals();
     let inliers = proposals.first().map_or(0, |best| best.inliers.len());
     let contradiction = |one: &Agreed| photo.contradiction(&one.camera_from_world);
@@ -153,10 +169,15 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     if proposals.is_empty() {
         return Outcome::Lost(refused.unwrap_or(Reason::NoPose { inliers }));
     }
-    match renderer.map_or(Verified::NotDrawn, |renderer| search.verified(&proposals, renderer, &found)) {
-        Verified::Yes(located) => Outcome::Found(located),
-        Verified::No => search.unverified(&proposals, MIN_INLIERS_AGAINST_RENDERING),
-        Verified::NotDrawn => search.unverified(&proposals, MIN_INLIERS),
+    let outcome =
+        match renderer.map_or(Verified::NotDrawn, |renderer| search.verified(&proposals, renderer, &found)) {
+            Verified::Yes(located) => Outcome::Found(located),
+            Verified::No => search.unverified(&proposals, MIN_INLIERS_AGAINST_RENDERING),
+            Verified::NotDrawn => search.unverified(&proposals, MIN_INLIERS),
+        };
+    match outcome {
+        Outcome::Found(found) if found.other_focal_px.is_some() => Outcome::Unsure(vec![*found]),
+        outcome => outcome,
     }
 }
 
@@ -173,20 +194,31 @@ struct Search<'a> {
     map: &'a Map,
     photo: &'a Photo<'a>,
     query: Query,
+    /// Its matches with all landmarks.
+    all: Vec<Match>,
     camera: Pinhole,
     size_px: DVec2,
+    /// The best fit at other focal lengths, once it is needed.
+    zoomed: OnceCell<Option<(Fit, f64)>>,
+}
+
+/// A camera with its pose, and the landmarks that agree.
+#[derive(Clone, Debug)]
+struct Fit {
+    camera: Pinhole,
+    camera_from_world: DAffine3,
+    matches: Vec<Match>,
 }
 
 impl Search<'_> {
     /// Returns distinct poses, most inliers first. Matches with all landmarks and with those of a few views are tried;
     /// if the first give too few inliers, also matches with single places, because two places may look alike.
     fn proposals(&self) -> Vec<Agreed> {
-        let agreed = |matches: &[Match]| ransac(&self.camera, matches, SEED);
-        let all = self.query.match_all(self.map);
-        let first = agreed(&all);
+        let agreed = |matches: &[Match]| ransac(&self.camera, matches, SEED, MAX_SAMPLES);
+        let first = agreed(&self.all);
         let votes =
             first.as_ref().filter(|first| first.inliers.len() >= MIN_INLIERS).map(|first| &first.inliers);
-        let second = agreed(&self.query.match_views(self.map, votes.unwrap_or(&all)));
+        let second = agreed(&self.query.match_views(self.map, votes.unwrap_or(&self.all)));
         let suffices = votes.is_some();
         let mut found: Vec<Agreed> = first.into_iter().chain(second).collect();
         if !suffices {
@@ -237,7 +269,7 @@ impl Search<'_> {
         for _ in 0..MAX_RENDERINGS {
             let Some(rendered) = compared.render(renderer, &pose) else { break };
             verified = Verified::No;
-            let seen = ransac(&self.camera, &compared.match_features(&rendered), SEED);
+            let seen = ransac(&self.camera, &compared.match_features(&rendered), SEED, MAX_SAMPLES);
             let n = seen.as_ref().map_or(0, |seen| seen.inliers.len());
             let enough = match seen {
                 Some(ref seen) if n >= MIN_RENDERED_INLIERS => Some(seen.clone()),
@@ -257,7 +289,7 @@ impl Search<'_> {
 
     /// Returns the pose on which patches agree, if they suffice to verify it.
     fn agreed_patches(&self, (matches, n_tried): &(Vec<Match>, usize)) -> Option<Agreed> {
-        let mut agreed = ransac(&self.camera, matches, SEED)?;
+        let mut agreed = ransac(&self.camera, matches, SEED, MAX_SAMPLES)?;
         agreed.inliers.retain(|one| self.camera.error(&agreed.camera_from_world, one) < PATCH_INLIER_PX);
         let n = agreed.inliers.len();
         (n >= MIN_PATCHES && n as f64 >= MIN_PATCH_SHARE * *n_tried as f64).then_some(agreed)
@@ -305,13 +337,69 @@ impl Search<'_> {
         if let Some(reason) = self.photo.contradiction(camera_from_world) {
             return Err(reason);
         }
-        let covariance = covariance(&self.camera, camera_from_world, inliers).ok_or(Reason::NoSpread)?;
+        let start =
+            Fit { camera: self.camera, camera_from_world: *camera_from_world, matches: inliers.clone() };
+        let (fit, is_other) = self.with_focal(&start);
+        let covariance =
+            covariance(&fit.camera, &fit.camera_from_world, &fit.matches).ok_or(Reason::NoSpread)?;
         Ok(Located {
-            camera_from_world: *camera_from_world,
+            camera_from_world: fit.camera_from_world,
             covariance,
-            n_inliers: inliers.len(),
+            n_inliers: fit.matches.len(),
             is_verified,
+            other_focal_px: is_other.then_some(fit.camera.focal_px()),
         })
+    }
+
+    /// Estimates the focal length too: the stated one counts with its standard deviation. Also returns whether the
+    /// landmarks contradict it; then they alone count.
+    fn with_focal(&self, start: &Fit) -> (Fit, bool) {
+        let zoomed = self.zoomed.get_or_init(|| self.zoomed(start)).clone();
+        let fits = self.freed(start).into_iter().chain(zoomed);
+        let Some((free, sigma)) = fits.max_by_key(|(fit, _)| fit.matches.len()) else {
+            return (start.clone(), false);
+        };
+        let off = free.camera.log_zoom(&self.camera);
+        let variance = FOCAL_SIGMA.powi(2);
+        let sum = variance + sigma * sigma;
+        if off.abs() > FOCAL_SIGMAS * sum.sqrt() {
+            return (free, true);
+        }
+        let camera = self.camera.zoomed(off * variance / sum);
+        let refined = refine::<POSE>(&camera, &start.camera_from_world, &start.matches, SOFT_PX);
+        let fit = |(camera, camera_from_world)| Fit { camera, camera_from_world, ..start.clone() };
+        (refined.map_or_else(|| start.clone(), fit), false)
+    }
+
+    /// Returns the best fit to the landmarks near a camera with any focal length, and the standard deviation of that
+    /// focal length's logarithm.
+    fn freed(&self, start: &Fit) -> Option<(Fit, f64)> {
+        let mut fit = start.clone();
+        for _ in 0..FREEING_ROUNDS {
+            let (camera, pose) =
+                refine::<POSE_AND_FOCAL>(&fit.camera, &fit.camera_from_world, &fit.matches, SOFT_PX)?;
+            let mut matches = self.query.match_guided(self.map, &camera, &pose, self.size_px);
+            matches.retain(|one| camera.error(&pose, one) < INLIER_PX);
+            fit = Fit { camera, camera_from_world: pose, matches };
+        }
+        let sigma = focal_sigma(&fit.camera, &fit.camera_from_world, &fit.matches)?;
+        Some((fit, sigma))
+    }
+
+    /// Returns the fit from the pose with most inliers at other focal lengths, as [`Self::freed`] does. `than`: the fit
+    /// that it must exceed.
+    fn zoomed(&self, than: &Fit) -> Option<(Fit, f64)> {
+        let is_inlier = |one: &&Match| than.camera.error(&than.camera_from_world, one) < INLIER_PX;
+        let share = self.all.iter().filter(is_inlier).count() as f64 / self.all.len() as f64;
+        let max_samples = samples(share, MAX_ZOOM_SAMPLES);
+        let zooms = (-N_ZOOMS..=N_ZOOMS).filter(|zoom| *zoom != 0);
+        let fits = zooms.filter_map(|zoom| {
+            let camera = self.camera.zoomed(f64::from(zoom) * ZOOM_STEP.ln());
+            let Agreed { camera_from_world, inliers: matches, .. } =
+                ransac(&camera, &self.all, SEED, max_samples)?;
+            Some(Fit { camera, camera_from_world, matches })
+        });
+        self.freed(&fits.max_by_key(|fit| fit.matches.len())?)
     }
 }
 

@@ -19,6 +19,10 @@ pub struct Match {
 const MAX_ROUNDS: usize = 12;
 /// Least standard deviation of a feature's position, pixels: that of SIFT and of the map.
 const MIN_SIGMA_PX: f64 = 0.5;
+/// Standard deviation of a stated focal length's relative error: calibrated phones are off by 1 to 2 %.
+pub(crate) const FOCAL_SIGMA: f64 = 0.02;
+/// The same of an estimate, besides what the scatter of the errors shows: depths of the map are wrong together.
+const MAP_FOCAL_SIGMA: f64 = 0.005;
 /// Median length of a normal vector of two components, in standard deviations: sqrt(2 ln 2).
 const MEDIAN_RADIUS: f64 = 1.1774;
 
@@ -44,6 +48,20 @@ impl Pinhole {
         ((pixel - self.centre) / self.focal).extend(1.0).normalize()
     }
 
+    /// Returns the camera with a focal length `exp(log)` times as long.
+    pub(crate) fn zoomed(&self, log: f64) -> Self {
+        Self { focal: self.focal * log.exp(), ..*self }
+    }
+
+    pub(crate) fn focal_px(&self) -> f64 {
+        self.focal.x
+    }
+
+    /// Logarithm of the focal length's ratio to another camera's.
+    pub(crate) fn log_zoom(&self, other: &Self) -> f64 {
+        (self.focal.x / other.focal.x).ln()
+    }
+
     /// Reprojection error of a match, pixels; infinite behind the camera.
     pub(crate) fn error(&self, camera_from_world: &DAffine3, one: &Match) -> f64 {
         let in_camera = camera_from_world.transform_point3(one.point_in_world);
@@ -51,19 +69,24 @@ impl Pinhole {
     }
 }
 
-/// Normal equations of a pose's six parameters: a small rotation and translation of the camera frame.
-struct Normal {
-    matrix: [[f64; 6]; 6],
-    vector: [f64; 6],
+/// Parameters of a pose: a small rotation and translation of the camera frame.
+pub(crate) const POSE: usize = 6;
+/// The same, then the focal length's relative change.
+pub(crate) const POSE_AND_FOCAL: usize = 7;
+
+/// Normal equations of the parameters.
+struct Normal<const N: usize> {
+    matrix: [[f64; N]; N],
+    vector: [f64; N],
 }
 
-fn normal_equations(
+fn normal_equations<const N: usize>(
     camera: &Pinhole,
     pose: &DAffine3,
     matches: &[Match],
     weight: impl Fn(f64) -> f64,
-) -> Normal {
-    let mut of = Normal { matrix: [[0.0; 6]; 6], vector: [0.0; 6] };
+) -> Normal<N> {
+    let mut of = Normal { matrix: [[0.0; N]; N], vector: [0.0; N] };
     for one in matches {
         let p = pose.transform_point3(one.point_in_world);
         let Some(pixel) = camera.pixel(p) else { continue };
@@ -72,12 +95,13 @@ fn normal_equations(
         let (fx, fy) = (camera.focal.x / p.z, camera.focal.y / p.z);
         // d pixel / d p, then d p = rotation x p + translation.
         let rows = [DVec3::new(fx, 0.0, -fx * p.x / p.z), DVec3::new(0.0, fy, -fy * p.y / p.z)];
-        for (row, error) in rows.into_iter().zip([error.x, error.y]) {
+        let spread = pixel - camera.centre;
+        for (row, error, spread) in [(rows[0], error.x, spread.x), (rows[1], error.y, spread.y)] {
             let turned = p.cross(row);
-            let j = [turned.x, turned.y, turned.z, row.x, row.y, row.z];
-            for a in 0..6 {
+            let j = [turned.x, turned.y, turned.z, row.x, row.y, row.z, spread];
+            for a in 0..N {
                 of.vector[a] += weight * j[a] * error;
-                for b in 0..6 {
+                for b in 0..N {
                     of.matrix[a][b] += weight * j[a] * j[b];
                 }
             }
@@ -87,10 +111,10 @@ fn normal_equations(
 }
 
 /// Inverts a positive definite matrix (Gauss-Jordan, largest pivot); `None` if it is singular.
-fn inverse(mut m: [[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
-    let mut out: [[f64; 6]; 6] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
-    for column in 0..6 {
-        let pivot = (column..6).max_by(|a, b| m[*a][column].abs().total_cmp(&m[*b][column].abs()))?;
+fn inverse<const N: usize>(mut m: [[f64; N]; N]) -> Option<[[f64; N]; N]> {
+    let mut out: [[f64; N]; N] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
+    for column in 0..N {
+        let pivot = (column..N).max_by(|a, b| m[*a][column].abs().total_cmp(&m[*b][column].abs()))?;
         m.swap(column, pivot);
         out.swap(column, pivot);
         let scale = m[column][column];
@@ -99,9 +123,9 @@ fn inverse(mut m: [[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
         }
         m[column].iter_mut().chain(&mut out[column]).for_each(|v| *v /= scale);
         let (row, out_row) = (m[column], out[column]);
-        for other in (0..6).filter(|other| *other != column) {
+        for other in (0..N).filter(|other| *other != column) {
             let factor = m[other][column];
-            for k in 0..6 {
+            for k in 0..N {
                 m[other][k] -= factor * row[k];
                 out[other][k] -= factor * out_row[k];
             }
@@ -110,17 +134,24 @@ fn inverse(mut m: [[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
     Some(out)
 }
 
-/// Refines a pose by least squares; errors above `soft_px` count less (Cauchy).
-pub(crate) fn refine(camera: &Pinhole, pose: &DAffine3, matches: &[Match], soft_px: f64) -> Option<DAffine3> {
-    let mut pose = *pose;
+/// Refines a pose, and the focal length with [`POSE_AND_FOCAL`], by least squares; errors above `soft_px` count less
+/// (Cauchy).
+pub(crate) fn refine<const N: usize>(
+    camera: &Pinhole,
+    pose: &DAffine3,
+    matches: &[Match],
+    soft_px: f64,
+) -> Option<(Pinhole, DAffine3)> {
+    let (mut camera, mut pose) = (*camera, *pose);
     for _ in 0..MAX_ROUNDS {
-        let of = normal_equations(camera, &pose, matches, |e| (1.0 + (e / soft_px).powi(2)).recip());
+        let of = normal_equations::<N>(&camera, &pose, matches, |e| (1.0 + (e / soft_px).powi(2)).recip());
         let inverse = inverse(of.matrix)?;
-        let step: [f64; 6] = std::array::from_fn(|a| (0..6).map(|b| inverse[a][b] * of.vector[b]).sum());
+        let step: [f64; N] = std::array::from_fn(|a| (0..N).map(|b| inverse[a][b] * of.vector[b]).sum());
         let turn = DQuat::from_scaled_axis(DVec3::new(step[0], step[1], step[2]));
         let shift = DVec3::new(step[3], step[4], step[5]);
         pose = DAffine3::from_rotation_translation(turn, shift) * pose;
-        if !pose.is_finite() {
+        camera = camera.zoomed(step.get(POSE).copied().unwrap_or(0.0));
+        if !pose.is_finite() || !camera.focal.is_finite() {
             return None;
         }
         if step.iter().all(|s| s.abs() < 1e-10) {
@@ -129,19 +160,38 @@ pub(crate) fn refine(camera: &Pinhole, pose: &DAffine3, matches: &[Match], soft_
     }
     // Products of rotations drift from length 1.
     let rotation = DQuat::from_mat3(&pose.matrix3).normalize();
-    Some(DAffine3::from_rotation_translation(rotation, pose.translation))
+    Some((camera, DAffine3::from_rotation_translation(rotation, pose.translation)))
 }
 
-/// Covariance of the camera's position and of a small rotation about the world's axes, row by row. The errors'
-/// standard deviation comes from their median.
-pub(crate) fn covariance(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -> Option<[f64; 36]> {
+/// Covariance of the parameters. The errors' standard deviation comes from their median; `prior` is that of the focal
+/// length's relative error before the photo is seen.
+fn covariance_in_camera(
+    camera: &Pinhole,
+    pose: &DAffine3,
+    matches: &[Match],
+    prior: f64,
+) -> Option<[[f64; POSE_AND_FOCAL]; POSE_AND_FOCAL]> {
     let mut errors: Vec<f64> = matches.iter().map(|one| camera.error(pose, one)).collect();
     errors.sort_by(f64::total_cmp);
-    let sigma = (errors.get(errors.len() / 2)? / MEDIAN_RADIUS).max(MIN_SIGMA_PX);
-    let of_camera = inverse(normal_equations(camera, pose, matches, |_| 1.0).matrix)?;
+    let variance = (errors.get(errors.len() / 2)? / MEDIAN_RADIUS).max(MIN_SIGMA_PX).powi(2);
+    let mut matrix = normal_equations::<POSE_AND_FOCAL>(camera, pose, matches, |_| 1.0).matrix;
+    matrix[POSE][POSE] += variance / (prior * prior);
+    let of = inverse(matrix)?.map(|row| row.map(|v| variance * v));
+    let with_focal = of[POSE].map(|v| v / of[POSE][POSE] * MAP_FOCAL_SIGMA);
+    Some(std::array::from_fn(|a| std::array::from_fn(|b| of[a][b] + with_focal[a] * with_focal[b])))
+}
+
+/// Standard deviation of the focal length's relative error, from the matches alone.
+pub(crate) fn focal_sigma(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -> Option<f64> {
+    Some(covariance_in_camera(camera, pose, matches, f64::INFINITY)?[POSE][POSE].sqrt())
+}
+
+/// Covariance of the camera's position and of a small rotation about the world's axes, row by row.
+pub(crate) fn covariance(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -> Option<[f64; 36]> {
+    let of_camera = covariance_in_camera(camera, pose, matches, FOCAL_SIGMA)?;
     // position = -R' t: d position = R' (rotation x t - d t) with t turned along, so rotation x t cancels t's part.
     let back = pose.matrix3.transpose();
-    let mut jacobian = [[0.0; 6]; 6];
+    let mut jacobian = [[0.0; POSE]; POSE];
     for column in 0..3 {
         let axis = DVec3::AXES[column];
         let (moved, turned) = (-(back * axis), -(back * axis));
@@ -154,7 +204,7 @@ pub(crate) fn covariance(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -
     for (i, out) in out.iter_mut().enumerate() {
         let (a, b) = (i / 6, i % 6);
         let product = |p: usize, q: usize| jacobian[a][p] * of_camera[p][q] * jacobian[b][q];
-        *out = sigma * sigma * (0..36).map(|pq| product(pq / 6, pq % 6)).sum::<f64>();
+        *out = (0..36).map(|pq| product(pq / 6, pq % 6)).sum::<f64>();
     }
     Some(out)
 }

@@ -5,11 +5,11 @@ use glam::{DAffine3, DMat3, DVec3};
 use slag_common::camera::roots_between;
 use slag_math::random::Random;
 
-use crate::pose::{Match, Pinhole, refine};
+use crate::pose::{Match, POSE, Pinhole, refine};
 
 pub(crate) const INLIER_PX: f64 = 5.0;
-/// Most samples tried: 12 % inliers are found with probability 0.9997.
-const MAX_SAMPLES: usize = 5000;
+/// Most samples tried for a pose: 12 % inliers are found with probability 0.9997.
+pub(crate) const MAX_SAMPLES: usize = 5000;
 /// Probability that one of the samples had inliers only.
 const CONFIDENCE: f64 = 0.9999;
 /// Rounds of refinement on the best pose's inliers.
@@ -48,15 +48,15 @@ fn cost(camera: &Pinhole, pose: &DAffine3, matches: &[Match], limit: f64) -> f64
     sum
 }
 
-/// Returns the pose with most inliers; `None` if no sample has a pose. Deterministic.
-pub(crate) fn ransac(camera: &Pinhole, matches: &[Match], seed: u64) -> Option<Agreed> {
+/// Returns the pose with most inliers of at most `max_samples`; `None` if no sample has a pose. Deterministic.
+pub(crate) fn ransac(camera: &Pinhole, matches: &[Match], seed: u64, max_samples: usize) -> Option<Agreed> {
     let n = matches.len();
     if n < 4 {
         return None;
     }
     let mut random = Random::new(seed);
     let mut best: Option<Agreed> = None;
-    let mut needed = MAX_SAMPLES;
+    let mut needed = max_samples;
     let mut tried = 0;
     while tried < needed {
         tried += 1;
@@ -70,9 +70,7 @@ pub(crate) fn ransac(camera: &Pinhole, matches: &[Match], seed: u64) -> Option<A
             let agreed = locally_refined(camera, pose, matches);
             if agreed.cost < limit {
                 let share = agreed.inliers.len() as f64 / n as f64;
-                // log(1 - p) / log(1 - share^3), with `ln_1p` for small shares.
-                let tries = (1.0 - CONFIDENCE).ln() / (-share.powi(3)).ln_1p();
-                needed = if tries < MAX_SAMPLES as f64 { tries.ceil() as usize } else { MAX_SAMPLES };
+                needed = samples(share, max_samples);
                 best = Some(agreed);
             }
         }
@@ -80,14 +78,21 @@ pub(crate) fn ransac(camera: &Pinhole, matches: &[Match], seed: u64) -> Option<A
     best
 }
 
+/// Returns the number of samples that find a share of inliers, at most `max`.
+pub(crate) fn samples(share: f64, max: usize) -> usize {
+    // log(1 - p) / log(1 - share^3), with `ln_1p` for small shares.
+    let tries = (1.0 - CONFIDENCE).ln() / (-share.powi(3)).ln_1p();
+    if tries < max as f64 { tries.ceil() as usize } else { max }
+}
+
 /// Refines a pose on its inliers while that lowers its cost.
 pub(crate) fn locally_refined(camera: &Pinhole, pose: DAffine3, matches: &[Match]) -> Agreed {
     let mut best = Agreed::of(camera, pose, matches);
     for _ in 0..LOCAL_ROUNDS {
         let refined = (best.inliers.len() >= 4)
-            .then(|| refine(camera, &best.camera_from_world, &best.inliers, SOFT_PX))
+            .then(|| refine::<POSE>(camera, &best.camera_from_world, &best.inliers, SOFT_PX))
             .flatten();
-        let Some(next) = refined.map(|pose| Agreed::of(camera, pose, matches)) else { break };
+        let Some(next) = refined.map(|(_, pose)| Agreed::of(camera, pose, matches)) else { break };
         if next.cost >= best.cost {
             break;
         }

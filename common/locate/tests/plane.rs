@@ -117,6 +117,34 @@ fn a_photo_is_located_and_another_floor_is_lost() {
     assert!(!found.is_verified);
 }
 
+/// As of a smaller copy with the whole photo's focal length, another zoom, or a guess; then as of a calibration that is
+/// off by 2 %.
+#[test]
+fn a_wrong_focal_length_is_told_or_held() {
+    let map = map_of(1);
+    let truth = looking(DVec3::new(0.6, -1.1, 1.7), DVec3::new(0.2, 0.3, 0.0));
+    let grey = draw(1, &truth, &INTRINSICS).grey;
+    let stated = |factor: f64| {
+        let focal_px = factor * INTRINSICS.focal_x_px;
+        let intrinsics = Intrinsics { focal_x_px: focal_px, focal_y_px: focal_px, ..INTRINSICS };
+        let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: None, prior: None };
+        [None, Some(&Floor(1) as &dyn Renderer)].map(|renderer| locate(&map, &photo, renderer))
+    };
+    for factor in [0.67, 1.1, 2.0] {
+        for outcome in stated(factor) {
+            let Outcome::Unsure(candidates) = outcome else { panic!("{factor}: {outcome:?}") };
+            let focal_px = candidates[0].other_focal_px.expect("another");
+            assert!((focal_px / INTRINSICS.focal_x_px - 1.0).abs() < 0.03, "{factor}: {focal_px}");
+        }
+    }
+    for outcome in stated(1.02) {
+        let Outcome::Found(found) = outcome else { panic!("{outcome:?}") };
+        let moved = found.camera_from_world.inverse().translation.distance(truth.inverse().translation);
+        let sigma = [0, 7, 14].map(|at| found.covariance[at]).iter().sum::<f64>().sqrt();
+        assert!(moved < 3.0 * sigma && sigma < 0.05, "{moved} {sigma}");
+    }
+}
+
 /// The same floor twice, 50 m apart: both poses are candidates, unless it is known which it is.
 #[test]
 fn places_that_look_alike_are_candidates() {

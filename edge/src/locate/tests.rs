@@ -144,7 +144,13 @@ fn the_body_of_a_level_camera_is_not_turned() {
         translation: DVec3::new(1.0, 2.0, 3.0),
     };
     let camera_from_world = world_from_camera.inverse();
-    let found = Located { camera_from_world, covariance: [0.0; 36], n_inliers: 9, is_verified: false };
+    let found = Located {
+        camera_from_world,
+        covariance: [0.0; 36],
+        n_inliers: 9,
+        is_verified: false,
+        other_focal_px: None,
+    };
     let Pose { position_in_world, rotation_xyzw, optical_rotation_xyzw, geographic, .. } =
         pose_of(&snapshot, &found);
     assert!(DVec3::from(position_in_world).distance(DVec3::new(1.0, 2.0, 3.0)) < 1e-12);
