@@ -289,6 +289,23 @@ fn a_robot_is_followed_by_its_service() {
     assert!(stop(serving).contains("fetched 1 shards of generation 3"));
 }
 
+/// As after a fetch whose cells were all taken from the scene.
+#[test]
+fn a_robot_without_cells_is_told_to_fetch() {
+    let dir = fetched(red_and_blue());
+    let path = dir.path().join("current");
+    let mut current = json(&fs_err::read_to_string(&path).expect("text"));
+    current["cells"] = serde_json::json!([]);
+    fs_err::write(&path, current.to_string()).expect("written");
+    let (code, out, _) = run(dir.path(), &["doctor", "--models", "colours"]);
+    let scene = out.lines().find(|line| line.contains("0 of 1 cells")).unwrap_or_default();
+    assert!(scene.starts_with("MISSING") && scene.contains("slag-edge fetch --at"), "{out}");
+    assert!(code == Some(1) && !out.contains("--occupancy"), "{out}");
+    fs_err::write(&path, "").expect("written");
+    let (_, out, _) = run(dir.path(), &["doctor"]);
+    assert!(out.lines().all(|line| line.matches("fetch again").count() < 2), "{out}");
+}
+
 /// A page is lost after the shard was checked and mapped: the program ends once, its next start does not answer from
 /// that shard, and the next fetch replaces it.
 #[test]

@@ -22,7 +22,9 @@ pub enum TufError {
     Content { what: String, fault: String },
     #[error("{what} is longer than {max_bytes} bytes, the most that is read of it")]
     TooLong { what: String, max_bytes: u64 },
-    #[error("{what} is missing in the store; check the address, or publish the scene again")]
+    #[error(
+        "{what} is missing in the store; see that the address is of `slag-encoder serve`, not of a robot, or publish the scene again"
+    )]
     Missing { what: String },
     #[error("{role} metadata came out of order")]
     Order { role: String },

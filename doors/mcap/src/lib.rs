@@ -6,7 +6,7 @@ mod messages;
 
 use std::time::SystemTime;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, anyhow};
 use serde_json::json;
 
 pub use args::Args;
@@ -53,6 +53,9 @@ pub fn record(args: &Args) -> Result<usize> {
         messages.iter().try_for_each(|(topic, schema, message)| file.write(topic, *schema, message))?;
         file.finish()
     });
-    written.with_context(|| args.out.display().to_string())?;
+    let out = args.out.display();
+    written.map_err(|error| {
+        anyhow!("{out}: {error:#}; give a file in a folder that exists, can be written and has space")
+    })?;
     Ok(messages.len())
 }

@@ -141,14 +141,17 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
             return vec![Verdict::Missing.on("scene", advice)];
         }
         Err(error) => {
-            let text = format!("{}; fetch again", error_line(&error));
+            let mut text = error_line(&error);
+            if !text.contains("fetch again") {
+                text += "; fetch again";
+            }
             return vec![Verdict::Missing.on("scene", text)];
         }
     };
     let status = Status::of(&snapshot);
     let unit = if status.metric { "m" } else { "world units" };
     let (n, of) = (status.shards.len(), status.n_cells_in_scene);
-    let scene = format!(
+    let mut scene = format!(
         "{}, generation {}, {n} of {of} cells, {} Gaussians, {}",
         status.scene,
         status.generation,
@@ -156,7 +159,11 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
         ByteSize(status.len_bytes)
     );
     let place = format!("{} {unit} around {:.2}", status.radius, status.centre_in_world);
-    let mut findings = vec![Verdict::Ok.on("scene", scene), Verdict::Ok.on("place", place)];
+    let verdict = if n > 0 { Verdict::Ok } else { Verdict::Missing };
+    if n == 0 {
+        scene += ": slag-edge fetch --at X,Y,Z --radius 50, at a place in the scene";
+    }
+    let mut findings = vec![verdict.on("scene", scene), Verdict::Ok.on("place", place)];
     if let Some(signed) = accepted(cache).ok().flatten().and_then(|accepted| accepted.signed_unix_secs) {
         findings.push(age(signed, crate::now_unix_secs()));
     }
@@ -167,7 +174,7 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
     if status.geo_reference.is_none() {
         note("latitude", "none: the scene has no geo-reference, so positions are in its world");
     }
-    if snapshot.shards.iter().all(|shard| shard.additions().occupancy.is_none()) {
+    if n > 0 && snapshot.shards.iter().all(|shard| shard.additions().occupancy.is_none()) {
         note("goal", "no places to stand: the scene was encoded without --occupancy");
     }
     findings

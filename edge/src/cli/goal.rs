@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use crate::query::parse_point;
 use crate::score::Budget;
+use anyhow::anyhow;
 use clap::Args;
 use glam::DVec3;
 use slag_api::goal::{Goal, GoalReply, MissedThing, NoGoal};
@@ -54,7 +55,8 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let GoalArgs { near, heading_rad, robot, stand, .. } = args;
     let request = GoalRequest { target, near, heading_rad, robot, stand };
     request.check()?;
-    args.map.iter().try_for_each(|path| files::check_writable(path))?;
+    let no_map = |error| anyhow!("{error}; give --map a file in a folder that can be written");
+    args.map.iter().try_for_each(|path| files::check_writable(path)).map_err(no_map)?;
     let engine = args.engine.open()?;
     let on_board = engine.on_board()?;
     if let Some(path) = &args.map {
