@@ -191,9 +191,23 @@ fn too_slow(error: &axum::Error) -> Option<&TooSlow> {
 /// Refuses a Content-Type outside `media_types`; any page may post forms and plain text without a preflight.
 pub(crate) fn check_type(headers: &HeaderMap, media_types: &[&str]) -> Result<(), Problem> {
     let found = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
-    let kind = found.and_then(|value| value.split(';').next()).unwrap_or_default().trim();
+    let mut parts = found.unwrap_or_default().split(';').map(str::trim);
+    let kind = parts.next().unwrap_or_default();
     if media_types.iter().any(|expected| kind.eq_ignore_ascii_case(expected)) {
-        return Ok(());
+        let charset = |part: &&str| part.get(..8).is_some_and(|name| name.eq_ignore_ascii_case("charset="));
+        let is_utf8 = |part: &str| {
+            ["utf-8", "utf8", "us-ascii"]
+                .iter()
+                .any(|name| part[8..].trim_matches('"').eq_ignore_ascii_case(name))
+        };
+        return match parts.find(charset).filter(|part| !is_utf8(part)) {
+            None => Ok(()),
+            Some(_) if kind.starts_with("image/") => Ok(()),
+            Some(part) => {
+                let shown: String = part.chars().take(60).collect();
+                Err(unsupported(format!("the body's Content-Type has {shown:?}, expected charset=utf-8")))
+            }
+        };
     }
     let shown: String = kind.chars().take(60).collect();
     Err(unsupported(format!("the body's Content-Type is {shown:?}, expected {}", media_types.join(" or "))))

@@ -108,32 +108,23 @@ impl<S: Send + Sync> FromRequestParts<S> for PathText {
 
 impl Taken for PathText {}
 
-/// A query string as a struct, or a tuple of structs that share it. Unknown parameters are refused.
+/// A query string as a struct, or a tuple of structs that share it, the last with all that is required. Unknown
+/// parameters are refused.
 pub struct Params<T>(pub T);
 
 impl<T: DeserializeOwned> Params<T> {
     /// Parses decoded `name=value` pairs.
     pub fn read(pairs: &[(String, String)]) -> Result<T, RequestError> {
         let mut reader = Pairs { pairs, known: Vec::new() };
-        // "Text" in place of "text": the name is wrong, not the value missing.
-        let misspelt = |error: RequestError| {
-            let is_like = |(name, _): &&(String, String)| {
-                *name != error.parameter && name.eq_ignore_ascii_case(&error.parameter)
-            };
-            match pairs.iter().find(is_like) {
-                Some((name, value)) => {
-                    RequestError::new(&shown(name), value, format!("the name {}", error.parameter))
-                }
-                None => error,
-            }
-        };
-        let read = T::deserialize(&mut reader).map_err(misspelt)?;
-        match pairs.iter().find(|(name, _)| !reader.known.contains(&name.as_str())) {
-            None => Ok(read),
-            Some((name, value)) => {
+        let read = T::deserialize(&mut reader);
+        let has = |name: &str| pairs.iter().any(|(other, _)| other == name);
+        match (read, pairs.iter().find(|(name, _)| !reader.known.contains(&name.as_str()))) {
+            // What is missing may have been given by another name.
+            (read, Some((name, value))) if read.as_ref().err().is_none_or(|error| !has(&error.parameter)) => {
                 let expected = format!("one of {}", reader.known.join(", "));
                 Err(RequestError::new(&shown(name), value, expected))
             }
+            (read, _) => read,
         }
     }
 

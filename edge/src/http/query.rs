@@ -41,28 +41,28 @@ const PLY: &str = "format=ply: a binary little-endian PLY with an element vertex
 pub fn parse_query(query_string: &str) -> Result<Ask, RequestError> {
     let uri: Result<Uri, _> = format!("/query?{query_string}").parse();
     let uri = uri.map_err(|e| RequestError::new("query string", &e.to_string(), "name=value pairs"))?;
-    let (params, area, short) = Params::<(AskParams, AreaParams, ShortParams)>::parse(&uri)?;
+    let (area, short, params) = Params::<(AreaParams, ShortParams, AskParams)>::parse(&uri)?;
     short.ask(params, area, &HeaderMap::new())
 }
 
 pub async fn short(
     State(app): State<Arc<App>>,
     headers: HeaderMap,
-    params: Result<Params<(AskParams, AreaParams, ShortParams)>, Problem>,
+    params: Result<Params<(AreaParams, ShortParams, AskParams)>, Problem>,
 ) -> Result<As<Formats>, Problem> {
-    let ask = params.and_then(|Params((params, area, short))| Ok(short.ask(params, area, &headers)?));
+    let ask = params.and_then(|Params((area, short, params))| Ok(short.ask(params, area, &headers)?));
     answer(&app, ask).await.map(As::new)
 }
 
 pub async fn get(
     State(app): State<Arc<App>>,
-    params: Result<Params<(AskParams, AreaParams)>, Problem>,
+    params: Result<Params<(AreaParams, AskParams)>, Problem>,
 ) -> Result<As<Json<Page<'static>>>, Problem> {
-    answer(&app, params.and_then(|Params((params, area))| Ok(params.ask(area)?))).await.map(As::new)
+    answer(&app, params.and_then(|Params((area, params))| Ok(params.ask(area)?))).await.map(As::new)
 }
 
 pub async fn post(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Json<Page<'static>>>, Problem> {
-    let ask: Ask = match serde_json::from_slice(&body) {
+    let ask: Ask = match serde_json::from_slice(body.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&body)) {
         Ok(ask) => ask,
         Err(error) => return answer(&app, Err(unreadable(&error))).await.map(As::new),
     };

@@ -1,5 +1,6 @@
 //! A page of answers: version 1's only reply type.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use glam::DVec3;
@@ -83,7 +84,7 @@ struct Nothing<'a> {
     /// The reason.
     kind: ReasonKind,
     /// The same in words.
-    detail: &'a str,
+    detail: Cow<'a, str>,
     /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
     #[serde(skip_serializing_if = "Option::is_none")]
     seen_share: Option<f64>,
@@ -171,6 +172,8 @@ impl<'a> Described<'a> {
         let (offset, limit) = (reply.request.offset, reply.request.page());
         let end = offset.saturating_add(limit);
         let generation = reply.manifest().generation;
+        let n = found.answers.len();
+        let beyond = (n > 0 && offset >= n).then(|| Nothing::beyond(offset, n));
         let related = found.related.as_ref();
         let thing = |(at, cluster): (usize, &'a ClusterAnswer)| {
             let to = related.map(|related| &related.to[at]);
@@ -193,8 +196,8 @@ impl<'a> Described<'a> {
             searched: related.is_none().then_some(&found.searched),
             coverage: &found.coverage,
             parts: related.map(|related| &*related.parts),
-            none: found.reason.as_ref().map(Nothing::new),
-            next_offset: (found.answers.len() > end).then_some(end),
+            none: found.reason.as_ref().map(Nothing::new).or(beyond),
+            next_offset: (n > end).then_some(end),
             answers,
         }
     }
@@ -204,12 +207,24 @@ impl<'a> Nothing<'a> {
     fn new(reason: &'a Reason) -> Self {
         Self {
             kind: reason.kind,
-            detail: &reason.detail,
+            detail: Cow::Borrowed(&reason.detail),
             seen_share: reason.seen_share,
             thing: reason.thing.as_deref(),
             best_score: reason.best_score,
             best_degree: reason.best_degree,
             best_position_in_world: reason.best_position_in_world,
+        }
+    }
+
+    fn beyond(offset: usize, n: usize) -> Self {
+        Self {
+            kind: ReasonKind::BeyondEnd,
+            detail: format!("{n} answers in all, offset {offset} is beyond them: give a smaller one").into(),
+            seen_share: None,
+            thing: None,
+            best_score: None,
+            best_degree: None,
+            best_position_in_world: None,
         }
     }
 }

@@ -25,6 +25,8 @@ pub enum ReasonKind {
     NothingThere,
     /// Views saw less than half of the region asked for.
     NotLookedThere,
+    /// There are answers, all before the page.
+    BeyondEnd,
     /// Of a phrase: nothing on board is such a thing.
     NoSuchThing,
     /// Of a phrase: such things are on board, but none is so placed.

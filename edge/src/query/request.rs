@@ -23,6 +23,8 @@ pub const MAX_GAUSSIANS: usize = 1_000_000;
 pub const MAX_PAGE: usize = MAX_CLUSTERS;
 pub const MAX_TEXTS: usize = 32;
 pub const MAX_NEGATIVES: usize = 16;
+/// Largest heading, four turns: more are degrees.
+const MAX_HEADING_RAD: f64 = 4.0 * std::f64::consts::TAU;
 /// LERF's canonical negatives (Kerr et al. 2023, section 3.3).
 pub const CANONICAL_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
 /// Default number of answers to each text.
@@ -300,8 +302,14 @@ impl QueryRequest {
         if let Some(threshold) = self.threshold.filter(|t| !thresholds.contains(t)) {
             return refuse("threshold", &threshold, expected.into());
         }
-        if let Some(heading) = self.heading_rad.filter(|heading| !heading.is_finite()) {
-            return refuse("heading_rad", &heading, "a number".into());
+        if let Some(heading) =
+            self.heading_rad.filter(|heading| !(-MAX_HEADING_RAD..=MAX_HEADING_RAD).contains(heading))
+        {
+            return refuse(
+                "heading_rad",
+                &heading,
+                format!("radians within ±{MAX_HEADING_RAD:.1}, four turns"),
+            );
         }
         if let Some(near) = self.near.filter(|near| !is_within(*near)) {
             return refuse("near", &near, format!("three numbers X,Y,Z within ±{MAX_COORDINATE:e}"));

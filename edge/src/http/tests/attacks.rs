@@ -50,6 +50,13 @@ async fn web_pages_neither_write_nor_read() {
             "unsupported-media-type",
         ),
         ("POST", "/position", &[], 415, "unsupported-media-type"),
+        (
+            "POST",
+            "/position",
+            &[("content-type", "application/json; Charset=\"utf-16\"")],
+            415,
+            "unsupported-media-type",
+        ),
         ("POST", "/position", &[json, ("origin", "https://evil.example")], 403, "foreign-origin"),
         ("POST", "/position", &[json, ("origin", "null")], 403, "foreign-origin"),
         ("POST", "/position", &[json, ("host", "evil.example")], 421, "wrong-host"),

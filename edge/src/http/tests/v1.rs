@@ -116,6 +116,9 @@ async fn pages_are_the_whole_in_pieces() {
             }
         }
         assert_eq!(all["answers"], Value::Array(pages), "{kind}");
+        assert_eq!(all["none"], Value::Null);
+        let (_, _, beyond) = service.get(&format!("/v1/query?text=0&kind={kind}&offset={offset}9")).await;
+        assert_eq!(beyond["results"][0]["none"]["kind"], "beyond-end", "{beyond:#}");
     }
 }
 
@@ -278,6 +281,7 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({"vectors": vec![[1.0, 0.0, 0.0]; 33]}), "vectors"),
         (json!({"texts": ["0 behind the 1"]}), "near"),
         (json!({"texts": ["0 left of me"], "near": [0, 0, 0]}), "heading_rad"),
+        (json!({"texts": ["0 left of me"], "near": [0, 0, 0], "heading_rad": 90}), "heading_rad"),
         (json!({"phrases": [{"thing": "me"}]}), "phrases"),
         (json!({"phrases": [{"thing": "0"}], "kind": "clusters"}), "kind"),
     ];
@@ -297,6 +301,8 @@ async fn wrong_requests_are_refused_by_name() {
         ("text=0&negative=%3F", "negative"),
         ("text=0&texts=1", "texts"),
         ("Text=0", "Text"),
+        ("q=0", "q"),
+        ("box=0,0,0,1,1,1", "text"),
         (&format!("text=0{}", "+on+0".repeat(8)), "text"),
         (&"text=0&".repeat(33), "text"),
     ] {
@@ -307,6 +313,8 @@ async fn wrong_requests_are_refused_by_name() {
     }
     assert_refused(&service.get("/v1/goal?text=0&near_lat_lon=47,8").await, "near_lat_lon", "a goal");
     assert_refused(&service.get("/v1/objects?near_lat_lon=47,8&radius=1").await, "near_lat_lon", "a list");
+    let marked = format!("\u{feff}{}", json!({"texts": ["0"]}));
+    assert_eq!(service.post("/v1/query", "application/json", marked).await.0, StatusCode::OK);
     let (status, _, body) = post(&service, &json!({"texts": ["sofa"]})).await;
     assert_eq!((status.as_u16(), &body["parameter"]), (422, &json!("texts")), "{body}");
     // serde's message is complete: it ends with the position, and lists the names.
