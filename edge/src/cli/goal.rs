@@ -55,7 +55,8 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let GoalArgs { near, heading_rad, robot, stand, .. } = args;
     let request = GoalRequest { target, near, heading_rad, robot, stand };
     request.check()?;
-    let no_map = |error| anyhow!("{error}; give --map a file in a folder that can be written");
+    let no_map =
+        |error| Failure::failed("map", anyhow!("{error}; give --map a file in a folder that can be written"));
     args.map.iter().try_for_each(|path| files::check_writable(path)).map_err(no_map)?;
     let engine = args.engine.open()?;
     let on_board = engine.on_board()?;
