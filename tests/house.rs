@@ -193,7 +193,8 @@ fn check_words(house: &Path, store: &Path, models: &Path) {
         let mut eval = lab(&["eval", "labelled", "--store", text(store)]);
         run_json(eval.args(["--truth", text(house), "--models", text(models)]).args(profile))
     };
-    let means = |report: &Value| (figure(&report["mean_area_under_roc"]), figure(&report["miou"]));
+    let means =
+        |report: &Value| (figure(&report["mean_area_under_roc"]), figure(&report["multi_class"][0]["miou"]));
     let field = evaluated(&[]);
     let words = field["words"].as_array().expect("words");
     assert_eq!(words.len(), reference["auc"].as_object().expect("words").len());

@@ -94,15 +94,18 @@ impl Gaussians {
     /// Readers keep unusable rows so that indices stay those of the file; later stages skip and count them.
     pub fn is_usable(&self, index: usize) -> bool {
         let norm2: f32 = self.rotations_wxyz[index].iter().map(|q| q * q).sum();
-        let n_rest = 3 * Self::sh_rest_per_channel(self.sh_degree);
-        // Absent where harmonics were not read.
-        let rest = self.sh_rest.get(index * n_rest..(index + 1) * n_rest).unwrap_or_default();
         self.means_in_world[index].to_array().iter().all(|x| x.abs() <= MAX_COORDINATE)
             && (norm2 - 1.0).abs() < 1e-3
             && self.scales[index].iter().all(|s| s.is_finite() && *s >= 0.0)
             && (0.0..=1.0).contains(&self.opacities[index])
             && self.sh_dc[index].iter().all(|c| c.is_finite())
-            && rest.iter().all(|c| c.is_finite())
+    }
+
+    /// Leaves Gaussians without higher harmonics where these are not finite; returns how many.
+    pub fn drop_broken_harmonics(&mut self) -> usize {
+        let rows = self.sh_rest.chunks_exact_mut((3 * Self::sh_rest_per_channel(self.sh_degree)).max(1));
+        let broken = rows.filter(|row| row.iter().any(|c| !c.is_finite()));
+        broken.map(|row| row.fill(0.0)).count()
     }
 
     /// Undoes the decoding for files whose scales (not logarithms) or opacities (not logits) were linear already.

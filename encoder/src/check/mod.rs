@@ -114,13 +114,16 @@ where
     })
 }
 
-/// Whether a drawing looks less like its photo than a plain colour does; `None` of a photo that has one colour.
+/// Whether a drawing looks less like its photo than a plain colour does, where the splat covers it; `None` of a photo
+/// that has one colour there.
 pub(crate) fn is_unlike(photo: CheckView, scene: &dyn LoadedScene) -> Result<Option<bool>, CheckError> {
-    let small = at_width(&photo, QUICK_WIDTH_PX)?;
+    let mut small = at_width(&photo, QUICK_WIDTH_PX)?;
+    let drawing = small.draw(scene)?;
+    // A splat need not show the sky.
+    small.leave_out(&drawing);
     if small.is_plain() {
         return Ok(None);
     }
-    let drawing = small.draw(scene)?;
     let psnr_db = small.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
     Ok(Some(!looks_alike(psnr_db, small.flat_psnr_db())))
 }

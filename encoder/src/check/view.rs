@@ -3,7 +3,7 @@
 use std::io::Cursor;
 
 use image::imageops::{self, FilterType};
-use image::{GrayImage, ImageFormat, RgbImage};
+use image::{GrayImage, ImageFormat, Luma, RgbImage};
 
 use crate::ingest::{IngestError, LoadedImage};
 use crate::raster::{Drawing, LoadedScene, RasterError, RasterView};
@@ -69,6 +69,14 @@ impl CheckView {
         scene
             .draw(&self.view, [0.0; 3])
             .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
+    }
+
+    /// Leaves out the pixels that the drawing does not cover.
+    pub(super) fn leave_out(&mut self, drawing: &Drawing) {
+        let (width_px, height_px) = self.image.dimensions();
+        let valid = self.valid.get_or_insert_with(|| GrayImage::from_pixel(width_px, height_px, Luma([255])));
+        let bare = valid.pixels_mut().zip(&drawing.coverage).filter(|(_, coverage)| **coverage <= 0.5);
+        bare.for_each(|(pixel, _)| *pixel = Luma([0]));
     }
 
     pub(super) fn is_plain(&self) -> bool {

@@ -68,6 +68,7 @@ fn checked(args: &CheckArgs) -> Result<(CheckReport, bool)> {
     let input = &args.input;
     let mut scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
     input.activated.undo(&mut scene);
+    ingest::drop_broken_harmonics(&mut scene);
     let poses = input.views.as_ref();
     let poses = poses.context("check compares the splat with photos; give their poses with --views")?;
     args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;

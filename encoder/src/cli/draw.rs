@@ -12,6 +12,7 @@ use slag_common::{Gaussians, View, poses};
 
 use super::common::{self, Exit, folder_of, print};
 use super::memory::default_memory_bytes;
+use crate::ingest;
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -90,7 +91,8 @@ impl DrawingArgs {
         let read: Vec<&Path> = read.flat_map(|path| [path, folder_of(path)]).collect();
         common::check([self.out.as_path()], &read, None)?;
         viewpoints::check_folder(&self.out)?;
-        let scene = splat::read(&self.scene, &ReadOptions { with_sh_rest: true })?;
+        let mut scene = splat::read(&self.scene, &ReadOptions { with_sh_rest: true })?;
+        ingest::drop_broken_harmonics(&mut scene);
         let name = self.scene.file_name().unwrap_or_default().to_string_lossy().into_owned();
         Ok((scene, Devices::open(&self.device, GpuOptions::default())?, name))
     }

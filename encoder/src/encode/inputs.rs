@@ -260,6 +260,7 @@ pub(super) fn make(
     let mut scene =
         context.time("read", || splat::read(&inputs.scene, &ReadOptions { with_sh_rest: true }))?;
     inputs.activated.undo(&mut scene);
+    ingest::drop_broken_harmonics(&mut scene);
     let device = engines.rasterizer.identity();
     let id = context.install(|| identity(&scene, planned, &device))?;
     let folder = inputs.views.parent().unwrap_or(Path::new("."));

@@ -187,7 +187,7 @@ fn unlike(inputs: &Inputs, scene: &dyn LoadedScene) -> [usize; 2] {
             counts[1] += 1;
         }
     }
-    if 2 * counts[0] > counts[1] {
+    if 4 * counts[0] >= 3 * counts[1].max(1) {
         let [n_unlike, of] = counts;
         tracing::warn!(
             "{n_unlike} of {of} compared views look less like their photos than a plain colour does: photos, poses and splat do \

@@ -162,7 +162,7 @@ pub struct EncodeSummary {
 impl EncodeSummary {
     /// Whether most of the compared views look like their photos.
     pub(crate) fn fits(&self) -> bool {
-        2 * self.n_unlike[0] <= self.n_unlike[1]
+        4 * self.n_unlike[0] < 3 * self.n_unlike[1].max(1)
     }
 
     /// Whether every view was used, and most of the splat.

@@ -10,7 +10,7 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, RgbImage};
 use serde::Deserialize;
 use slag_common::photo::{self, PhotoError};
-use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View, files};
+use slag_common::{ByteSize, Distortion, Gaussians, Hash32, Intrinsics, View, files};
 
 pub use splat_frame::{Activated, FrameChoice, GeoError, read_geo_reference, to_poses};
 pub(crate) use splat_frame::{FoundFrame, find_frame};
@@ -316,4 +316,15 @@ fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> [u8; 3] {
         let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
         (top + (bottom - top) * fy).round() as u8
     })
+}
+
+/// Warns of harmonics that are not finite, and takes them as 0.
+pub(crate) fn drop_broken_harmonics(scene: &mut Gaussians) {
+    match scene.drop_broken_harmonics() {
+        0 => {}
+        n => tracing::warn!(
+            "{n} of {} Gaussians have harmonics (f_rest) that are not finite; they are drawn without",
+            scene.len()
+        ),
+    }
 }
