@@ -158,12 +158,6 @@ fn intrinsics(
         ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
             ([fx, fy], [cx, cy], Distortion::Fisheye { k: [k1, k2, k3, k4] })
         }
-        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k]) => {
-            ([f, f], [cx, cy], Distortion::Fisheye { k: [k, 0.0, 0.0, 0.0] })
-        }
-        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => {
-            ([f, f], [cx, cy], Distortion::Fisheye { k: [k1, k2, 0.0, 0.0] })
-        }
         _ => {
             let model = excerpt(model);
             return Err(match MODELS.iter().find(|(_, name, _)| *name == model) {
