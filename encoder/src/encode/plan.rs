@@ -15,7 +15,7 @@ use super::coverage::{self, Coverage};
 use super::error::EncodeError;
 use super::inputs::{self, Inputs};
 use super::job::{Job, JobStatus, job_status};
-use super::report::LostViews;
+use super::report::{LostViews, are_unlike};
 use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSettings};
 use super::view::ViewTools;
 use crate::cells::CellSplit;
@@ -187,7 +187,7 @@ fn unlike(inputs: &Inputs, scene: &dyn LoadedScene) -> [usize; 2] {
             counts[1] += 1;
         }
     }
-    if 4 * counts[0] >= 3 * counts[1].max(1) {
+    if are_unlike(counts) {
         let [n_unlike, of] = counts;
         tracing::warn!(
             "{n_unlike} of {of} compared views look less like their photos than a plain colour does: photos, poses and splat do \

@@ -159,10 +159,15 @@ pub struct EncodeSummary {
     pub encoder: String,
 }
 
+/// Whether views that were drawn and compared do not look like their photos: three quarters of them.
+pub(super) fn are_unlike([n_unlike, n_compared]: [usize; 2]) -> bool {
+    4 * n_unlike >= 3 * n_compared.max(1)
+}
+
 impl EncodeSummary {
     /// Whether most of the compared views look like their photos.
     pub(crate) fn fits(&self) -> bool {
-        4 * self.n_unlike[0] < 3 * self.n_unlike[1].max(1)
+        !are_unlike(self.n_unlike)
     }
 
     /// Whether every view was used, and most of the splat.
