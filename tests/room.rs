@@ -48,6 +48,36 @@ fn stores_are_equal_to_the_byte() {
     assert_eq!(content(&store), one);
 }
 
+/// Photos of other frames are published, but told and with the exit code of a misfit; so is what robots lose.
+#[test]
+fn photos_that_do_not_fit_and_what_robots_lose_are_told() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (room, store) = (dir.path().join("room"), dir.path().join("store"));
+    copy_dir(&generated(&ROOM), &room);
+    let quick = ["--models", "colours", "--profiles", "compact"];
+    run(encode_quickly(&room, &store).args([
+        "--models",
+        "colours",
+        "--profiles",
+        "compact,balanced",
+        "--occupancy",
+    ]));
+    let mut poses = read_json(&room.join("transforms.json"));
+    let frames = poses["frames"].as_array_mut().expect("frames");
+    let mut photos: Vec<Value> = frames.iter().map(|frame| frame["file_path"].clone()).collect();
+    photos.rotate_left(frames.len() / 2);
+    frames.iter_mut().zip(photos).for_each(|(frame, photo)| frame["file_path"] = photo);
+    fs_err::write(room.join("transforms.json"), poses.to_string()).expect("writes");
+    let output = encode_quickly(&room, &store).args(quick).output().expect("starts");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(4), "{said}");
+    assert!(
+        said.contains("look less like their photos")
+            && said.contains("free places (--occupancy), balanced shards (--profiles)"),
+        "{said}"
+    );
+}
+
 /// Each user mistake gets a message with a remedy.
 #[test]
 fn mistakes_are_named() {

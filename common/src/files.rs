@@ -41,19 +41,16 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     read_short(path, 1 << 32)
 }
 
-/// The encoding of a text that is not UTF-8.
+/// What a file is instead of what was expected, and what to do then.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum NotUtf8 {
-    #[error(
-        "the text is UTF-16, expected UTF-8; save it as UTF-8, or convert it with iconv -f UTF-16 -t UTF-8"
-    )]
-    Utf16,
-    #[error("the text is not UTF-8; save it with that encoding")]
-    Other,
+#[error("{what}; {advice}")]
+pub struct Stranger {
+    pub what: &'static str,
+    pub advice: &'static str,
 }
 
 /// Returns the text of a file without its byte order mark, which editors and shells of Windows write.
-pub fn text_of(bytes: &[u8]) -> Result<&str, NotUtf8> {
+pub fn text_of(bytes: &[u8]) -> Result<&str, Stranger> {
     // Without a mark, every second byte of ASCII text in UTF-16 is 0.
     let is_utf16 = match bytes {
         [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => true,
@@ -61,9 +58,24 @@ pub fn text_of(bytes: &[u8]) -> Result<&str, NotUtf8> {
         _ => false,
     };
     if is_utf16 {
-        return Err(NotUtf8::Utf16);
+        let advice = "save it as UTF-8, or convert it with iconv -f UTF-16 -t UTF-8";
+        return Err(Stranger { what: "the text is UTF-16, expected UTF-8", advice });
     }
-    let text = std::str::from_utf8(bytes).map_err(|_| NotUtf8::Other)?;
+    let packed = match bytes {
+        [0x1f, 0x8b, ..] => Some("the file is packed with gzip, expected text"),
+        [b'P', b'K', 3, 4, ..] => Some("the file is a zip archive, expected text"),
+        [0x28, 0xb5, 0x2f, 0xfd, ..] => Some("the file is packed with zstd, expected text"),
+        [0xfd, b'7', b'z', b'X', b'Z', ..] => Some("the file is packed with xz, expected text"),
+        _ => None,
+    };
+    if let Some(what) = packed {
+        return Err(Stranger { what, advice: "unpack it, and give what was in it" });
+    }
+    if let Some(stranger) = stand_in(bytes) {
+        return Err(stranger);
+    }
+    let not_utf8 = Stranger { what: "the text is not UTF-8", advice: "save it with that encoding" };
+    let text = std::str::from_utf8(bytes).map_err(|_| not_utf8)?;
     Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
 }
 
@@ -80,14 +92,16 @@ pub fn check_writable(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Returns what a file is if it is a well-known stand-in, by its first bytes, and what to do then.
-pub fn stand_in(start: &[u8]) -> Option<(&'static str, &'static str)> {
+/// Returns what a file is if it is a well-known stand-in, by its first bytes.
+pub fn stand_in(start: &[u8]) -> Option<Stranger> {
     match start.trim_ascii_start() {
         [b'v', b'e', b'r', b's', b'i', b'o', b'n', b' ', b'h', b't', b't', b'p', ..] => {
-            Some(("a pointer of Git LFS", "bring the file itself with `git lfs pull`"))
+            let advice = "bring the file itself with `git lfs pull`";
+            Some(Stranger { what: "this is a pointer of Git LFS", advice })
         }
         [b'<', b'!' | b'?' | b'h' | b'H', ..] => {
-            Some(("a web page", "the download was refused or needs a login: download the file itself"))
+            let advice = "the download was refused or needs a login: download the file itself";
+            Some(Stranger { what: "this is a web page", advice })
         }
         _ => None,
     }
@@ -126,34 +140,38 @@ mod tests {
 
     #[test]
     fn what_stands_in_a_files_place_is_named() {
-        let named = |start: &[u8]| stand_in(start).map(|(what, _)| what);
-        assert_eq!(named(b"version https://git-lfs.github.com/spec/v1\n"), Some("a pointer of Git LFS"));
-        assert_eq!(named(b"\n<html><body>Please log in"), Some("a web page"));
-        assert_eq!(named(b"<!DOCTYPE html>"), Some("a web page"));
+        let named = |start: &[u8]| stand_in(start).map(|stranger| stranger.what);
+        assert_eq!(
+            named(b"version https://git-lfs.github.com/spec/v1\n"),
+            Some("this is a pointer of Git LFS")
+        );
+        assert_eq!(named(b"\n<html><body>Please log in"), Some("this is a web page"));
+        assert_eq!(named(b"<!DOCTYPE html>"), Some("this is a web page"));
         for other in [&b"ply\nformat"[..], b"version 2", b"<svg", b"<", b""] {
             assert_eq!(named(other), None);
         }
     }
 
     #[test]
-    fn texts_of_windows_are_read_or_named() {
-        assert_eq!(text_of("\u{feff}[ä]".as_bytes()), Ok("[ä]"));
-        assert_eq!(
-            (text_of(b""), text_of(b"{"), text_of(&[0; 9])),
-            (Ok(""), Ok("{"), Ok("\0".repeat(9).as_str()))
-        );
+    fn texts_of_windows_are_read_and_strangers_are_named() {
+        let of = |bytes: &[u8]| text_of(bytes).map(str::to_owned).map_err(|stranger| stranger.to_string());
+        assert_eq!(of("\u{feff}[ä]".as_bytes()), Ok("[ä]".into()));
+        for text in ["", "{", &"\0".repeat(9)] {
+            assert_eq!(of(text.as_bytes()), Ok(text.into()));
+        }
+        let named = |bytes: &[u8], word: &str| {
+            let said = of(bytes).expect_err("is refused");
+            assert!(said.contains(word), "{said}");
+        };
         let units = |text: &str| text.encode_utf16().collect::<Vec<u16>>();
         for text in ["\u{feff}[1]", "[1]"] {
-            let little: Vec<u8> = units(text).into_iter().flat_map(u16::to_le_bytes).collect();
-            let big: Vec<u8> = units(text).into_iter().flat_map(u16::to_be_bytes).collect();
-            assert_eq!(
-                (text_of(&little), text_of(&big)),
-                (Err(NotUtf8::Utf16), Err(NotUtf8::Utf16)),
-                "{text:?}"
-            );
+            named(&units(text).into_iter().flat_map(u16::to_le_bytes).collect::<Vec<u8>>(), "iconv");
+            named(&units(text).into_iter().flat_map(u16::to_be_bytes).collect::<Vec<u8>>(), "iconv");
         }
-        assert_eq!(text_of(b"caf\xe9"), Err(NotUtf8::Other));
-        assert!(NotUtf8::Utf16.to_string().contains("iconv"));
+        named(b"caf\xe9", "not UTF-8");
+        named(b"\x1f\x8b\x08\0", "gzip");
+        named(b"PK\x03\x04", "zip archive");
+        named(b"<html>", "web page");
     }
 
     #[test]

@@ -461,6 +461,10 @@ fn transforms_cameras_are_shared_or_per_frame() {
         "distortion_params": [0.1, -0.2, 0.3, 0, 0.4, 0.5]});
     let listed = read_json(listed).unwrap().views[0].intrinsics.distortion;
     assert_eq!(listed, Distortion::Brown { k: [0.1, -0.2, 0.3], p: [0.4, 0.5] });
+    let short = serde_json::json!({"fl_x": 60, "w": 64, "h": 48, "frames": [frame("a.jpg")],
+        "distortion_params": [0.1, -0.2, 0.3, 0.4]});
+    let error = read_json(short).unwrap_err().to_string();
+    assert!(error.contains("6 numbers in distortion_params") && error.contains("found 4"), "{error}");
     // OpenGL cameras look along -z with y up: the point is 5 ahead of the camera and 1 above it.
     let in_camera = a_point_in_camera(&views[1], DVec3::new(1.0, 3.0, -2.0));
     assert!((in_camera - DVec3::new(0.0, -1.0, 5.0)).length() < 1e-12, "{in_camera}");

@@ -216,6 +216,7 @@ fn damaged_frames_are_named() {
     assert!(message(r#"{"transform": [[1,0,0,0]], "scale": 1}"#).contains("3 or 4 rows"));
     let scaled = message(r#"{"transform": [[2,0,0,0],[0,2,0,0],[0,0,2,0]], "scale": 1}"#);
     assert!(scaled.contains("its rotation is off by"), "{scaled}");
+    assert!(message(&format!("[{unit}, 1, null]")).contains("members have names"));
     assert!(message(&" ".repeat(70_000)).contains("70000 bytes"));
     fs_err::write(&path, format!("\u{feff}{{\"transform\": {unit}, \"scale\": 2}}")).unwrap();
     assert!(SplatFrame::read(&path).is_ok(), "a byte order mark");

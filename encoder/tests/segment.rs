@@ -599,6 +599,24 @@ fn masks_are_matched_with_their_photos() {
     assert!(said.contains("b.png is read") && said.ends_with("b.json beside it is not"), "{said}");
 }
 
+/// Counted from 1 in place of 0, one name is a photo's, and the wrong one; of a part of the photos, all are right.
+#[test]
+fn masks_of_other_photos_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let views = ["0.jpg", "9.jpg", "18.jpg", "1.jpg"].map(|name| view(name, 4, 3));
+    let check = || {
+        let given = GivenMasks::open(dir.path(), Vec::new()).unwrap();
+        given.check_views(&views, false).map_err(|error| error.to_string())
+    };
+    fs_err::write(dir.path().join("1.json"), "[]").unwrap();
+    assert!(check().unwrap().unwrap().contains("3 of 4"));
+    for other in ["2.json", "3.json", "4.json"] {
+        fs_err::write(dir.path().join(other), "[]").unwrap();
+    }
+    let error = check().unwrap_err();
+    assert!(error.contains("3 of 4") && error.contains("2.json, 3.json, 4.json"), "{error}");
+}
+
 /// A file of masks that two photos share is refused, until each has its own.
 #[test]
 fn masks_belong_to_one_photo() {

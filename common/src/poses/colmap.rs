@@ -14,7 +14,7 @@ use super::error::{Place, PoseError, PoseProblem};
 use super::paths::{PhotoFinder, parent};
 use super::view_set::{Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
-use crate::files::{self, NotUtf8};
+use crate::files;
 
 /// Longest image name read from a binary file, bytes: Linux's limit for a path.
 const MAX_NAME_BYTES: u64 = 4096;
@@ -289,11 +289,8 @@ impl Lines {
         bytes.clear();
         self.number += 1;
         let n = self.reader.read_until(b'\n', &mut bytes)?;
-        let text = match self.number {
-            1 => files::text_of(&bytes).map(str::to_owned),
-            _ => String::from_utf8(bytes).map_err(|_| NotUtf8::Other),
-        };
-        self.line = text.map_err(|fault| self.fail(fault.into()))?;
+        let text = files::text_of(&bytes).map(str::to_owned);
+        self.line = text.map_err(|stranger| self.fail(stranger.into()))?;
         Ok(n > 0)
     }
 

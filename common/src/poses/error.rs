@@ -4,7 +4,7 @@ use std::fmt::{self, Debug, Display};
 use std::io;
 use std::path::Path;
 
-use crate::files::NotUtf8;
+use crate::files::Stranger;
 
 /// Why poses are not read: the file, the place of the fault, what is wrong, and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -66,7 +66,7 @@ impl PoseProblem {
 
     pub(super) fn too_large(bytes: u64, most: u64, expected: &str) -> Self {
         let fault = format!("the file has {bytes} bytes, at most {most} were expected of {expected}");
-        Self::new(fault, "check that it is that")
+        Self::new(fault, "check that it is the right file")
     }
 
     pub(super) fn unsafe_name(image: &str) -> Self {
@@ -80,8 +80,8 @@ impl PoseProblem {
     }
 }
 
-impl From<NotUtf8> for PoseProblem {
-    fn from(fault: NotUtf8) -> Self {
-        Self::new(fault.to_string(), "give that file")
+impl From<Stranger> for PoseProblem {
+    fn from(stranger: Stranger) -> Self {
+        Self::new(stranger.what, stranger.advice)
     }
 }

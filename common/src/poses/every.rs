@@ -1,5 +1,6 @@
 //! Every Nth frame of a set of views.
 
+use std::collections::{BTreeSet, HashSet};
 use std::num::NonZeroU32;
 
 use super::view_set::ViewSet;
@@ -8,39 +9,35 @@ impl ViewSet {
     /// Keeps every `n`th frame by number: the last run of digits in its file name (`frame_00040.jpg` is 40).
     ///
     /// Counting begins at the lowest number of its folder, frames without a pose included, so the choice does not
-    /// depend on which poses are known. If any name has no number, all frames are counted by name.
+    /// depend on which poses are known. Where names of a folder share a number (`a_1_v2.jpg`) or have none, its frames
+    /// are counted by name.
     pub fn every(mut self, n: NonZeroU32) -> Self {
-        let n = u64::from(n.get());
-        let mut names: Vec<&str> = self
-            .views
-            .iter()
-            .map(|v| v.name.as_str())
-            .chain(
-                self.without_pose.iter().chain(self.damaged.iter().map(|(name, _)| name)).map(String::as_str),
-            )
-            .collect();
-        names.sort_unstable();
-        let numbers: Option<Vec<u64>> = names.iter().map(|name| number(name)).collect();
-        let numbers = numbers.unwrap_or_else(|| (0..names.len() as u64).collect());
-        let mut kept = Vec::new();
-        // Folders are contiguous: names of a folder share everything before the last slash.
-        let rows: Vec<(&str, u64, &str)> =
-            names.iter().zip(numbers).map(|(name, number)| (folder(name), number, *name)).collect();
-        let mut lowest = std::collections::BTreeMap::new();
-        for (folder, number, _) in &rows {
-            let low = lowest.entry(*folder).or_insert(*number);
-            *low = (*low).min(*number);
+        let damaged = self.damaged.iter().map(|(name, _)| name);
+        let posed = self.views.iter().map(|view| &view.name);
+        let names: BTreeSet<&str> =
+            posed.chain(&self.without_pose).chain(damaged).map(String::as_str).collect();
+        let names: Vec<&str> = names.into_iter().collect();
+        let mut kept = HashSet::new();
+        // Names of a folder are neighbours: they share everything before the last slash.
+        for frames in names.chunk_by(|a, b| folder(a) == folder(b)) {
+            let numbers: Option<BTreeSet<u64>> = frames.iter().map(|name| number(name)).collect();
+            let lowest =
+                numbers.filter(|numbers| numbers.len() == frames.len()).and_then(|n| n.first().copied());
+            let place = |(rank, name): (u64, &&str)| match lowest {
+                Some(lowest) => number(name).unwrap_or(rank) - lowest,
+                None => rank,
+            };
+            let chosen = (0..).zip(frames).filter(|frame| place(*frame).is_multiple_of(n.get().into()));
+            kept.extend(chosen.map(|(_, name)| (*name).to_owned()));
         }
-        for (folder, number, name) in rows {
-            let low = lowest.get(folder).copied().unwrap_or_default();
-            if (number - low).is_multiple_of(n) {
-                kept.push(name.to_owned());
-            }
+        if n.get() > 1 && names.len() > 1 && kept.len() == names.len() {
+            self.notes.push(format!(
+                "every {n}th frame is every frame: the numbers in the names are multiples of {n} apart; take a multiple of that"
+            ));
         }
-        let is_kept = |name: &String| kept.binary_search(name).is_ok();
-        self.views.retain(|view| is_kept(&view.name));
-        self.without_pose.retain(is_kept);
-        self.damaged.retain(|(name, _)| is_kept(name));
+        self.views.retain(|view| kept.contains(&view.name));
+        self.without_pose.retain(|name| kept.contains(name));
+        self.damaged.retain(|(name, _)| kept.contains(name));
         self
     }
 }

@@ -31,9 +31,14 @@ use crate::files;
 /// `transforms.json`, or ScanNet's `color/`. Images need not exist, except ScanNet's: only they tell their size.
 pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
     let not_found = || {
+        let train = path.join("transforms_train.json");
+        let advice = match train.is_file() {
+            true => format!("give {}", train.display()),
+            false => "give the folder of a COLMAP model, a transforms.json or a ScanNet scene".to_owned(),
+        };
         let fault = "no poses found: it has no cameras and images (.bin or .txt), directly or in sparse/0 or sparse, no \
-                     transforms.json and no pose/; give the folder of a COLMAP model, a transforms.json or a ScanNet scene";
-        Err(PoseError::of(path, fault))
+                     transforms.json and no pose/";
+        Err(PoseError::of(path, format_args!("{fault}; {advice}")))
     };
     if files::metadata(path)?.is_file() {
         return match path.extension().and_then(|e| e.to_str()) {

@@ -41,7 +41,10 @@ pub struct SplatFrame {
     from_poses: bool,
 }
 
+crate::named_members!(Json; Serialize);
+
 #[derive(Serialize, Deserialize)]
+#[serde(remote = "Self")]
 struct Json {
     transform: Vec<Vec<f64>>,
     scale: f64,

@@ -47,7 +47,7 @@ struct Camera {
     b1: Option<f64>,
     b2: Option<f64>,
     /// k1, k2, k3, k4, p1, p2; goes before these (`nerfstudio_dataparser.py`).
-    distortion_params: Option<[f64; 6]>,
+    distortion_params: Option<Vec<f64>>,
 }
 
 /// An element of `frames`.
@@ -313,7 +313,7 @@ impl Camera {
             k6: self.k6.or(shared.k6),
             b1: self.b1.or(shared.b1),
             b2: self.b2.or(shared.b2),
-            distortion_params: self.distortion_params.or(shared.distortion_params),
+            distortion_params: self.distortion_params.clone().or_else(|| shared.distortion_params.clone()),
         }
     }
 
@@ -339,9 +339,13 @@ impl Camera {
 
     /// Returns the lens distortion; as in nerfstudio, every perspective model may have coefficients.
     fn distortion(&self) -> Result<Distortion, PoseProblem> {
-        let [k1, k2, k3, k4, p1, p2] = self.distortion_params.unwrap_or_else(|| {
-            [self.k1, self.k2, self.k3, self.k4, self.p1, self.p2].map(|c| c.unwrap_or(0.0))
-        });
+        let [k1, k2, k3, k4, p1, p2] = match &self.distortion_params {
+            None => [self.k1, self.k2, self.k3, self.k4, self.p1, self.p2].map(|c| c.unwrap_or(0.0)),
+            Some(all) => <[f64; 6]>::try_from(&**all).map_err(|_| {
+                let expected = "6 numbers in distortion_params: k1, k2, k3, k4, p1, p2";
+                PoseProblem::expected(expected, all.len())
+            })?,
+        };
         // OpenCV's rational model, Metashape's affinity.
         let further = [(self.k5, "k5"), (self.k6, "k6"), (self.b1, "b1"), (self.b2, "b2")];
         let further = further.into_iter().find(|(value, _)| value.is_some_and(|value| value != 0.0));

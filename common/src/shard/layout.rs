@@ -31,6 +31,11 @@ impl ShardHeader {
         check_header(&header).is_ok().then_some(header)
     }
 
+    /// Whether a shard has a section, by its first [`HEADER_END_BYTES`], unchecked.
+    pub fn has_section(start: &[u8], id: u32) -> bool {
+        section_by_start(start, MAGIC, id).is_some()
+    }
+
     /// Returns the box of the places that positions may have: that of the means.
     pub fn position_box(&self) -> Aabb {
         let steps = self.position_bits.map(|bits| ((1u64 << bits) - 1) as f64);

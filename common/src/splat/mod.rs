@@ -11,7 +11,7 @@
 //! A file is read front to back into the columns, so memory is the decoded size plus one buffer (SOG: one or two
 //! images). Counts in a file are compared with its length before memory is reserved.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::{Gaussians, files};
 
@@ -28,6 +28,27 @@ pub use columns::ReadOptions;
 pub use error::SplatError;
 use input::Input;
 
+/// The error for a folder that is no unpacked SOG, with the splat that a training run left in it.
+fn no_splat(folder: &Path) -> SplatError {
+    let entries = |folder: &Path| {
+        let entries = fs_err::read_dir(folder).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).collect::<Vec<_>>()
+    };
+    let is_splat = |path: &PathBuf| path.is_file() && path.extension().is_some_and(|e| e == "ply");
+    // 3DGS writes point_cloud/iteration_N/point_cloud.ply, gsplat ply/NAME.ply; the longest training is the largest N.
+    let beside = entries(folder).into_iter().chain(entries(&folder.join("ply")));
+    let trained = entries(&folder.join("point_cloud")).into_iter().map(|run| run.join("point_cloud.ply"));
+    let number = |path: &PathBuf| {
+        let digits: String = path.to_string_lossy().chars().filter(char::is_ascii_digit).collect();
+        (digits.len(), digits)
+    };
+    let advice = match beside.chain(trained).filter(is_splat).max_by_key(number) {
+        Some(found) => format!("give {}", found.display()),
+        None => "give the splat's file".to_owned(),
+    };
+    SplatError::at(folder, "folder", format_args!("it is no unpacked SOG, which has a meta.json; {advice}"))
+}
+
 /// Reads a splat file of any supported format.
 ///
 /// For SOG, `path` is the bundle, its unpacked folder, or the `meta.json` in that folder.
@@ -38,11 +59,12 @@ use input::Input;
 /// [`SplatError`], with the file, the place of the fault, and the remedy.
 pub fn read(path: &Path, options: &ReadOptions) -> Result<Gaussians, SplatError> {
     if files::metadata(path)?.is_dir() {
-        return sog::read_folder(&path.join("meta.json"), *options);
+        let meta = path.join("meta.json");
+        return if meta.is_file() { sog::read_folder(&meta, *options) } else { Err(no_splat(path)) };
     }
     let mut input = Input::open(path)?;
-    if let Some((format, advice)) = files::stand_in(input.peek(64)?) {
-        return Err(SplatError::unsupported(path, format, advice));
+    if let Some(stranger) = files::stand_in(input.peek(64)?) {
+        return Err(SplatError::at(path, "byte 0", stranger));
     }
     let start = input.peek(4)?.to_vec();
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();

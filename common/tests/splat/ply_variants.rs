@@ -111,6 +111,31 @@ fn plain_colours_stand_in_for_harmonics() {
     }
 }
 
+/// No logit is an integer: 51 of 255 is a fifth.
+#[test]
+fn opacities_in_bytes_are_shares() {
+    let names = "x y z rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
+    let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
+    let header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty uchar opacity\n";
+    let rows = ["0", "51"].map(|opacity| format!("{opacity} 1 2 3 2 0 0 0 0 0 0 0 0 0\n")).concat();
+    let found = read_well("bytes.ply", format!("{header}{floats}end_header\n{rows}").as_bytes());
+    assert_eq!(found.opacities, [0.0, 0.2]);
+}
+
+/// A training run's folder, as 3DGS writes it, is no unpacked SOG; the longest training is named.
+#[test]
+fn the_splat_in_a_folder_is_named() {
+    let run = tempfile::tempdir().expect("a folder");
+    let said = || read_all(run.path()).expect_err("is refused").to_string();
+    assert!(said().contains("no unpacked SOG") && said().ends_with("give the splat's file"), "{}", said());
+    for n in [7000, 30_000] {
+        let folder = run.path().join(format!("point_cloud/iteration_{n}"));
+        std::fs::create_dir_all(&folder).expect("makes");
+        std::fs::write(folder.join("point_cloud.ply"), "ply").expect("writes");
+    }
+    assert!(said().ends_with("iteration_30000/point_cloud.ply"), "{}", said());
+}
+
 #[test]
 fn rows_that_cannot_be_drawn_keep_their_place() {
     let header = "ply\nformat ascii 1.0\nelement vertex 4\n";

@@ -73,7 +73,7 @@ fn checked(args: &CheckArgs) -> Result<(CheckReport, bool)> {
     let poses = poses.context("check compares the splat with photos; give their poses with --views")?;
     args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;
     let mut set = poses::read(poses, input.images.as_deref())?;
-    let mut notes = set.notes.clone();
+    let mut notes = std::mem::take(&mut set.notes);
     let frame = match ingest::drawn_from(poses) {
         Some(splat) => {
             notes.push(format!(
@@ -87,6 +87,7 @@ fn checked(args: &CheckArgs) -> Result<(CheckReport, bool)> {
     if let Some(n) = input.every {
         set = set.every(n);
     }
+    notes.append(&mut set.notes);
     notes.extend(set.left_out());
     let n_left_out = set.damaged.len();
     // The similarity that a file states: the cameras are moved by it.

@@ -6,10 +6,9 @@ use std::path::Path;
 
 use anyhow::Result;
 use glam::DVec3;
-use slag_common::files;
 use slag_common::frames::Aabb;
 use slag_common::manifest::CellRecord;
-use slag_common::shard::{HEADER_END_BYTES, ShardHeader};
+use slag_common::shard::ShardHeader;
 
 use super::common::InputArgs;
 use crate::ingest::{Activated, FrameChoice};
@@ -18,6 +17,8 @@ use crate::store::metadata::MetadataReader;
 
 /// Share of the Gaussians that the extent leaves out on each side of each axis: strays lie far away.
 const STRAY_SHARE: f64 = 0.02;
+/// Wider scenes are outdoors.
+const HOUSE_M: f64 = 25.0;
 const PORT: u16 = 7733;
 
 /// Lines for a published store: extent, `query` and `serve` here, `trust` and `fetch` on the robot.
@@ -37,10 +38,7 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
 pub(super) fn of_robot(reader: &StoreReader, url: &str) -> Result<String> {
     let manifest = reader.manifest();
     let root = MetadataReader::new(reader.dir()).root_sha256()?;
-    let boxes: Vec<(Aabb, f64)> = (manifest.cells.iter())
-        .map(|cell| (mean_box(reader, cell).unwrap_or(cell.bounds), f64::from(cell.n_gaussians)))
-        .collect();
-    let (extent, at) = extent_and_place(&boxes);
+    let (extent, at) = extent_and_place(&boxes_of(reader));
     let unit = if manifest.metric { "m" } else { "world units" };
     let size = extent.max - extent.min;
     let base = ["0.0.0.0", "[::]"].iter().fold(url.to_owned(), |url, any| url.replace(any, &host_name()));
@@ -62,7 +60,15 @@ pub(super) fn of_robot(reader: &StoreReader, url: &str) -> Result<String> {
 
 /// A word to ask for: drones survey yards and streets.
 fn example(reader: &StoreReader) -> &'static str {
-    if reader.manifest().geo_reference.is_some() { "car" } else { "chair" }
+    let (extent, _) = extent_and_place(&boxes_of(reader));
+    let width_m = (extent.max - extent.min).truncate().max_element();
+    if reader.manifest().geo_reference.is_some() && width_m > HOUSE_M { "car" } else { "chair" }
+}
+
+/// Each cell's box without the size of its Gaussians, with their number.
+fn boxes_of(reader: &StoreReader) -> Vec<(Aabb, f64)> {
+    let of = |cell: &CellRecord| (mean_box(reader, cell).unwrap_or(cell.bounds), f64::from(cell.n_gaussians));
+    reader.manifest().cells.iter().map(of).collect()
 }
 
 pub(super) fn of_check(input: &InputArgs) -> String {
@@ -96,9 +102,7 @@ fn of_input(input: &InputArgs) -> String {
 /// Box around a cell's means, which ignores the size of large Gaussians, from the head of one of its shards; `None`
 /// where that cannot be read.
 fn mean_box(reader: &StoreReader, cell: &CellRecord) -> Option<Aabb> {
-    let shard = cell.shards.values().next()?;
-    let head = files::read_short(&reader.object_path(shard.hash), HEADER_END_BYTES).ok()?;
-    Some(ShardHeader::of_start(&head)?.position_box())
+    Some(ShardHeader::of_start(&reader.shard_head(cell)?)?.position_box())
 }
 
 /// Extent without strays, and the centre of the cell in the middle of the Gaussians. `boxes`: each cell's, with its

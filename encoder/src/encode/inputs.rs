@@ -165,7 +165,6 @@ pub(crate) fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), Enc
 /// Reads the poses of every nth frame, and counts the drawings.
 fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
     let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;
-    set.notes.iter().for_each(|note| tracing::warn!("{note}"));
     let mut n_drawn = ingest::drawn_from(&inputs.views).map_or(0, |_| set.views.len());
     for path in &inputs.added {
         n_drawn += add_views(&mut set, &inputs.views, path)?;
@@ -175,6 +174,7 @@ fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
         set = set.every(n);
         tracing::info!("every {n}th frame: {} of {n_frames}", set.views.len() + set.without_pose.len());
     }
+    set.notes.iter().for_each(|note| tracing::warn!("{note}"));
     if let Some(left_out) = set.left_out() {
         tracing::info!("{left_out}");
     }

@@ -5,9 +5,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-use slag_common::Hash32;
-use slag_common::manifest::Manifest;
-use slag_common::shard::Profile;
+use slag_common::shard::{Profile, ShardHeader};
+use slag_common::{Hash32, occupancy};
 use slag_models::SessionOptions;
 
 use super::context::{Engines, RunContext};
@@ -129,7 +128,7 @@ pub(super) fn plan<'a>(
 fn encoder_before(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>) -> Option<String> {
     // Without a generation, or with a damaged one, there is nothing to report.
     let reader = StoreReader::open(&settings.output.store).ok()?;
-    let lost = lost(reader.manifest(), settings, inputs);
+    let lost = lost(&reader, settings, inputs);
     if !lost.is_empty() {
         tracing::warn!(
             "{}: its generation {} has {}; this encode has not, and robots that use that fail after their next fetch",
@@ -159,7 +158,12 @@ fn encoder_before(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<
 }
 
 /// What a generation has and the next will not, with the flag that keeps it.
-fn lost(before: &Manifest, settings: &EncodeSettings, inputs: &Inputs) -> Vec<String> {
+fn lost(reader: &StoreReader, settings: &EncodeSettings, inputs: &Inputs) -> Vec<String> {
+    let before = reader.manifest();
+    let has = |section| {
+        let heads = before.cells.iter().filter_map(|cell| reader.shard_head(cell));
+        heads.take(1).any(|head| ShardHeader::has_section(&head, section))
+    };
     let is_geographic = inputs.geo_reference.is_some();
     let has_no = |profile: &&Profile| !settings.cells.shards.profiles.contains(profile);
     let profiles: BTreeSet<&Profile> = before.cells.iter().flat_map(|cell| cell.shards.keys()).collect();
@@ -167,6 +171,8 @@ fn lost(before: &Manifest, settings: &EncodeSettings, inputs: &Inputs) -> Vec<St
     let others = [
         (before.metric && !settings.inputs.metric && !is_geographic, "metres (--metric)"),
         (before.geo_reference.is_some() && !is_geographic, "a geo-reference (--geo)"),
+        (settings.cells.occupancy.is_none() && has(occupancy::section::HEADER), "free places (--occupancy)"),
+        (!settings.cells.landmarks && has(slag_common::landmarks::section::HEADER), "landmarks (--locate)"),
         (before.encoder.text_model.is_some() && !settings.output.text_model, "a text model (--text-model)"),
     ];
     others.iter().filter(|(is_lost, _)| *is_lost).map(|(_, what)| (*what).to_owned()).chain(shards).collect()

@@ -1,12 +1,12 @@
 //! The frame of the splat against that of the poses: which file says so.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::fmt;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
-use serde_json::Value;
+use serde::de::IgnoredAny;
 use slag_common::frames::{GeoReference, Geographic};
 use slag_common::poses::{AppliedTransform, FRAME_FILE, PoseError, PoseSource, SplatFrame, SplatFromPoses};
 use slag_common::{Gaussians, Similarity, files};
@@ -109,21 +109,30 @@ pub enum GeoError {
     File { path: PathBuf, problem: String },
 }
 
+// A list may have GeoJSON's order.
+slag_common::named_members!(GeoFile, Origin);
+
 #[derive(Deserialize)]
+#[serde(remote = "Self")]
 struct GeoFile {
     origin: Origin,
+    #[serde(flatten)]
+    other: BTreeMap<String, IgnoredAny>,
 }
 
 #[derive(Deserialize)]
+#[serde(remote = "Self")]
 struct Origin {
     lat: f64,
     lon: f64,
     alt: f64,
+    #[serde(flatten)]
+    other: BTreeMap<String, IgnoredAny>,
 }
 
 const MAX_BYTES: u64 = 1 << 20;
 
-/// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; other fields are ignored.
+/// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; warns of other members.
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let mut bytes = Vec::new();
     files::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
@@ -131,13 +140,13 @@ pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let text = files::text_of(&bytes).map_err(|error| wrong(error.to_string()))?;
     let expected = r#"expected {"origin": {"lat": DEGREES, "lon": DEGREES, "alt": METRES}}"#;
     let malformed = |error: serde_json::Error| wrong(format!("{error}; {expected}"));
-    // Maps first, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's; then structs, since a map
-    // would take a name twice.
-    let maps: HashMap<String, Value> = serde_json::from_str(text).map_err(malformed)?;
-    if let Some(origin) = maps.get("origin") {
-        HashMap::<String, Value>::deserialize(origin).map_err(malformed)?;
+    let GeoFile { origin, other } = serde_json::from_str(text).map_err(malformed)?;
+    if let Some(name) = other.keys().chain(origin.other.keys()).next() {
+        tracing::warn!(
+            "{}: member {name:?} is not read; x is east, y north, z up, in metres",
+            path.display()
+        );
     }
-    let GeoFile { origin } = serde_json::from_str(text).map_err(malformed)?;
     let range = |field: &'static str, value: f64, min: f64, max: f64| match (min..=max).contains(&value) {
         true => Ok(value),
         false => Err(wrong(format!(

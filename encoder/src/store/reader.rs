@@ -1,15 +1,15 @@
 //! The lock-free side of a store: needs the manifest, the public key and the objects alone.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
-use slag_common::manifest::{Manifest, ShardRecord, TextModelRecord};
+use slag_common::manifest::{CellRecord, Manifest, ShardRecord, TextModelRecord};
 use slag_common::objects::Objects;
-use slag_common::shard::{ShardLayout, ShardView};
+use slag_common::shard::{HEADER_END_BYTES, ShardLayout, ShardView};
 
 use super::files::ModelsRecord;
 use super::{StoreError, files};
@@ -148,6 +148,14 @@ impl StoreReader {
     /// Path of an object, which need not exist.
     pub(crate) fn object_path(&self, hash: Hash32) -> PathBuf {
         object_path(&self.dir, hash)
+    }
+
+    /// First bytes of one of a cell's shards, with its header and table; `None` where they cannot be read.
+    pub(crate) fn shard_head(&self, cell: &CellRecord) -> Option<Vec<u8>> {
+        let file = slag_common::files::open(&self.object_path(cell.shards.values().next()?.hash)).ok()?;
+        let mut head = Vec::new();
+        file.take(HEADER_END_BYTES).read_to_end(&mut head).ok()?;
+        Some(head)
     }
 
     pub fn read_object(&self, hash: Hash32) -> Result<AlignedBytes, StoreError> {

@@ -53,3 +53,12 @@ fn names_without_numbers_count_by_place() {
     assert_eq!(every(&["a.png", "b.png", "c7.png"], &[], 2).0, ["a.png", "c7.png"]);
     assert_eq!(number("99999999999999999999999.png"), None);
 }
+
+/// By hand: the last number is the same everywhere, so places count; stamps in steps of 5 are told.
+#[test]
+fn numbers_that_do_not_count_frames_are_passed_over_or_told() {
+    let names = ["f_1_v2.jpg", "f_2_v2.jpg", "f_3_v2.jpg", "f_4_v2.jpg"];
+    assert_eq!(every(&names, &[], 3).0, ["f_1_v2.jpg", "f_4_v2.jpg"]);
+    let stamps = set(&["1005.jpg", "1010.jpg", "1030.jpg"], &[]).every(NonZeroU32::new(5).unwrap());
+    assert!(stamps.views.len() == 3 && stamps.notes[0].contains("multiples of 5"), "{:?}", stamps.notes);
+}

@@ -1,8 +1,8 @@
 //! PLY files of trained splats, as 3DGS (Kerbl et al. 2023), gsplat, nerfstudio and brush write them, and
 //! compressed PLY files of PlayCanvas. Properties may have any order and type.
 //!
-//! Per vertex: mean `x y z`, rotation `rot_0..3` (wxyz), scale `scale_0..2` (logarithm), `opacity` (logit), colour
-//! `f_dc_0..2` (or `red green blue`), `f_rest_*` (channel by channel); other properties are ignored.
+//! Per vertex: mean `x y z`, rotation `rot_0..3` (wxyz), scale `scale_0..2` (logarithm), `opacity` (logit, or
+//! unsigned integers whose largest is opaque), colour `f_dc_0..2` (or `red green blue`), `f_rest_*` (channel by channel); other properties are ignored.
 
 mod compressed;
 mod container;
@@ -72,6 +72,8 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
         wanted.extend(rest);
     }
 
+    // No logit is an integer: bytes are shares of 255.
+    let opaque = ply.elements[vertex].largest(wanted[7]);
     ply.seek_element(vertex)?;
     let mut out = columns(ply.checked_count(vertex)?, degree);
     ply.rows(&wanted, |row| {
@@ -82,7 +84,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
         out.rotations_wxyz.push(unit_rotation([*w, *i, *j, *k]));
         let [s0, s1, s2] = [s0, s1, s2].map(|s| s.exp() as f32);
         out.scales.push([s0, s1, if is_ball || third_scale.is_some() { s2 } else { 0.0 }]);
-        out.opacities.push(sigmoid(*logit));
+        out.opacities.push(opaque.map_or_else(|| sigmoid(*logit), |opaque| (logit / opaque) as f32));
         out.sh_dc.push([r, g, b].map(|c| *c as f32));
         out.sh_rest.extend(rest.iter().map(|c| *c as f32));
     })?;

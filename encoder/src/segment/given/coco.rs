@@ -256,8 +256,8 @@ pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>
     let n_pixels = input.image.width() as usize * input.image.height() as usize;
     let limits = png::Limits { bytes: 2 * n_pixels + PNG_OVERHEAD_BYTES };
     let mut file = BufReader::new(files::open(path)?);
-    if let Some((what, advice)) = files::stand_in(file.fill_buf()?) {
-        return Err(SegmentError::of_file(path, format!("{what}; {advice}")));
+    if let Some(stranger) = files::stand_in(file.fill_buf()?) {
+        return Err(SegmentError::of_file(path, stranger));
     }
     let mut decoder = png::Decoder::new_with_limits(file, limits);
     decoder.set_transformations(png::Transformations::IDENTITY);

@@ -2,7 +2,7 @@
 
 mod coco;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use slag_common::{Hash32, View, files};
@@ -106,20 +106,30 @@ impl GivenMasks {
         Some(format!("{} is read for masks, and {} beside it is not", read.display(), not.display()))
     }
 
-    /// Up to three names of files or entries.
-    fn names_found(&self) -> Vec<String> {
-        match &self.source {
-            Source::DataSet { masks_of_image, .. } => masks_of_image.keys().take(3).cloned().collect(),
+    /// Names of files, folders or entries from which no view has masks.
+    fn unmatched(&self, views: &[View]) -> Vec<String> {
+        let mut names: BTreeSet<String> = match &self.source {
+            Source::DataSet { masks_of_image, .. } => masks_of_image.keys().cloned().collect(),
             Source::Folder(dir) => {
-                let name =
-                    |entry: std::io::Result<fs_err::DirEntry>| entry.ok()?.file_name().into_string().ok();
                 let entries = fs_err::read_dir(dir).into_iter().flatten();
-                let mut names: Vec<String> = entries.filter_map(name).collect();
-                names.sort();
-                names.truncate(3);
-                names
+                entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).collect()
+            }
+        };
+        for view in views {
+            let name = match &self.source {
+                Source::DataSet { masks_of_image, .. } => {
+                    coco::entry(masks_of_image, &view.name).map(|(entry, _)| entry.clone())
+                }
+                Source::Folder(dir) => file_of(dir, view).and_then(|path| {
+                    let first = path.strip_prefix(dir).ok()?.components().next()?;
+                    Some(first.as_os_str().to_str()?.to_owned())
+                }),
+            };
+            if let Some(name) = name {
+                names.remove(&name);
             }
         }
+        names.into_iter().collect()
     }
 
     /// Masks of an id image; `is_binary`: the one mask of a black and white image.
@@ -170,8 +180,8 @@ impl Segmenter for GivenMasks {
             Source::Folder(path) | Source::DataSet { path, .. } => path,
         };
         let (view, n, of) = (&first.name, without.len(), views.len());
-        if without.len() == views.len() {
-            let found = self.names_found();
+        let found = self.unmatched(views);
+        if n == of {
             let is_langsplat = found.iter().any(|name| name.ends_with("_s.npy") || name.ends_with("_f.npy"));
             let hint = match is_langsplat {
                 true => {
@@ -179,10 +189,20 @@ impl Segmenter for GivenMasks {
                 }
                 false => "",
             };
-            let found = if found.is_empty() { "nothing".into() } else { found.join(", ") };
+            let found = if found.is_empty() { "nothing".into() } else { first_of(&found) };
             let problem = format!(
                 "no masks of any photo: for {view:?} expected a file of that name with the ending .png or .json (or a folder \
                  with 0.png, 1.png ...), or a COCO file_name like it; found {found}{hint}"
+            );
+            return Err(SegmentError::of_file(path, problem));
+        }
+        // Counted from 1 in place of 0, or of another flight: those that match have the masks of another photo.
+        if 2 * n > of && found.len() >= n {
+            let problem = format!(
+                "{n} of {of} photos have no masks, the first is {view:?}, and {} names match no photo ({}); name masks \
+                 after their photos, or take the others away",
+                found.len(),
+                first_of(&found)
             );
             return Err(SegmentError::of_file(path, problem));
         }
@@ -214,6 +234,11 @@ impl Segmenter for GivenMasks {
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
         Ok(self.load(input)?.unwrap_or_default())
     }
+}
+
+/// Up to three names.
+fn first_of(names: &[String]) -> String {
+    names[..names.len().min(3)].join(", ")
 }
 
 /// A view's mask file in a folder of masks, or the folder with one file per mask.
