@@ -90,6 +90,9 @@ pub(super) struct PhotosArgs {
     /// Seed of the first scene; the others follow.
     #[arg(long, default_value_t = 2_000_000)]
     seed: u64,
+    /// Photos of drones, 8 to 40 m up.
+    #[arg(long)]
+    aerial: bool,
 }
 
 pub(super) fn run(command: &GenerateCommand, progress: &dyn Progress) -> Result<Exit> {
@@ -110,7 +113,7 @@ pub(super) fn run(command: &GenerateCommand, progress: &dyn Progress) -> Result<
         }
         GenerateCommand::Photos(args) => {
             let seeds = args.seed..args.seed + args.n_scenes;
-            let n = photos::write(&args.out, seeds, progress)?;
+            let n = photos::write(&args.out, seeds, args.aerial, progress)?;
             println!("{n} photos in {}", args.out.display());
         }
     }

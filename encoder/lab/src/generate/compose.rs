@@ -285,25 +285,32 @@ impl Layout {
         match walk {
             Walk::Oval => self.walk(n_views, 0.0, photo_intrinsics()),
             Walk::Everywhere => self.roam(n_views, photo_intrinsics()),
-            Walk::Above => self.fly(n_views, photo_intrinsics()),
+            Walk::Above => self.fly(n_views, 0, 6.0..18.0, photo_intrinsics()),
         }
     }
 
-    /// Returns cameras above all areas, which look down by 45 to 80 degrees in headings of [`Layout::roam`].
-    fn fly(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
+    /// Returns cameras above all areas, which look down by 45 to 80 degrees in headings of [`Layout::roam`], from step
+    /// `start` on.
+    pub fn fly(
+        &self,
+        n_views: u32,
+        start: u32,
+        heights_m: std::ops::Range<f64>,
+        intrinsics: Intrinsics,
+    ) -> Vec<RasterView> {
         let (low, last) = (self.areas[0].corner, self.areas[self.areas.len() - 1]);
         let size = last.corner + last.size - low;
         let camera = |i: u32| {
             let i = f64::from(i);
             let spread = (STEP * (i + 1.0)).fract();
-            let height_m = 6.0 + 12.0 * (GOLDEN_ANGLE * i).fract();
+            let height_m = heights_m.start + (heights_m.end - heights_m.start) * (GOLDEN_ANGLE * i).fract();
             let down = (45.0 + 35.0 * (STEP.x * GOLDEN_ANGLE * i).fract()).to_radians().tan();
             let (sin, cos) = (GOLDEN_ANGLE * i).sin_cos();
             // What the camera looks at lies over the area, not the camera.
             let at = low + size * spread - DVec2::new(cos, sin) * height_m / down;
             looking(at.extend(height_m), DVec3::new(cos, sin, -down))
         };
-        (0..n_views).map(|i| RasterView { camera_from_world: camera(i), intrinsics }).collect()
+        (start..start + n_views).map(|i| RasterView { camera_from_world: camera(i), intrinsics }).collect()
     }
 
     /// Returns cameras all over the walkable places, with low-discrepancy places (Roberts' R2) and headings (golden

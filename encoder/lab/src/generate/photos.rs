@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use slag_common::npy;
 
 use super::compose::{FIELD_OF_VIEW_RAD, Layout, PHOTO_PX, pinhole};
+use super::grammar::SceneKind;
 use super::render::{NOTHING, Photo};
 use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
@@ -16,14 +17,28 @@ const N_PHOTOS: u32 = 4;
 /// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`), `things.npy` (u16
 /// `[n][height][width]`: the thing's number, 65535 for the sky) and `depths.npy` (f32 `[n][height][width]`: metres
 /// along the camera's axis, infinite for the sky). Returns the number of photos.
-pub fn write(folder: &Path, seeds: std::ops::Range<u64>, progress: &dyn Progress) -> Result<usize> {
+///
+/// From the ground, or from drones 8 to 40 m up.
+pub fn write(
+    folder: &Path,
+    seeds: std::ops::Range<u64>,
+    are_aerial: bool,
+    progress: &dyn Progress,
+) -> Result<usize> {
     fs_err::create_dir_all(folder)?;
     progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
     let of_seed = |seed: u64| {
-        let layout = Layout::of_any_kind(seed, &|_, _| true);
+        let layout = match are_aerial {
+            true => Layout::new(&[SceneKind::Yard, SceneKind::Street], seed, &|_, _| true),
+            false => Layout::of_any_kind(seed, &|_, _| true),
+        };
         let solids = layout.solids();
         let start = Xorshift::new(seed ^ 0xf070).between(0.0, 1.0);
-        let views = layout.walk(N_PHOTOS, start, pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD));
+        let intrinsics = pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD);
+        let views = match are_aerial {
+            true => layout.fly(N_PHOTOS, (start * 1e6) as u32, 8.0..40.0, intrinsics),
+            false => layout.walk(N_PHOTOS, start, intrinsics),
+        };
         let photos: Vec<Photo> = views.iter().map(|view| solids.photo(view)).collect();
         progress.advance(1);
         photos
