@@ -2,7 +2,7 @@
 
 use std::io::Write;
 
-use crate::query::{ChangesError, ChangesRequest};
+use crate::query::ChangesRequest;
 use crate::score::Budget;
 use clap::Args;
 use slag_api::changes::{ChangedThing, ChangesReply, MovedThing};
@@ -34,10 +34,7 @@ pub fn run(args: ChangesArgs) -> Result<(), Failure> {
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload()?;
     let request = ChangesRequest { from: args.from, to: args.to, ball: None, texts: args.texts };
-    let reply = engine.changes(&request, &Budget::default()).map_err(|error| match error {
-        ChangesError::Query(error) => error.into(),
-        other => Failure::failed(other.kind(), other),
-    })?;
+    let reply = engine.changes(&request, &Budget::default())?;
     if args.json {
         return print_json(&reply);
     }

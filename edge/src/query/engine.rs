@@ -36,6 +36,9 @@ pub enum QueryError {
     EncoderMismatch { models_name: String, models_id: Hash32, scene_name: String, scene_id: Hash32 },
     #[error(transparent)]
     Score(#[from] ScoreError),
+    /// What is on board has nothing to answer from. `kind` and `title` are stable names.
+    #[error("{detail}")]
+    Unable { kind: &'static str, title: &'static str, detail: String },
 }
 
 impl From<OverBudget> for QueryError {
@@ -61,6 +64,7 @@ impl QueryError {
             Self::Score(ScoreError::OverBudget(OverBudget::Together { .. })) => "overloaded",
             Self::Score(ScoreError::OverBudget(_)) => "over-budget",
             Self::Score(_) => "score",
+            Self::Unable { kind, .. } => kind,
         }
     }
 }

@@ -34,7 +34,7 @@ pub use answer::answer;
 pub use answers::{Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Searched};
 pub use area::{Area, AreaBall, AreaBox, Corner, LatLon, Point};
 pub use ask::Ask;
-pub use changes::{ChangesError, ChangesRequest};
+pub use changes::{ChangesRequest, NO_SUCH_GENERATION};
 pub(crate) use coverage::coverage;
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
