@@ -8,7 +8,6 @@ mod find;
 pub mod http;
 mod list;
 mod locate;
-mod picture;
 mod place;
 mod stand;
 mod tools;

@@ -50,24 +50,27 @@ impl Robot {
 
     /// Posts a request to `/v1/query`.
     pub fn ask(&self, request: &Value) -> Result<Reply, RobotError> {
-        check_texts(texts_of(request))?;
-        self.post("/v1/query", request)
+        self.ask_for(request)
     }
 
     /// As [`Self::ask`], for matching Gaussians.
     pub fn ask_points(&self, request: &Value) -> Result<Reply<PointAnswer>, RobotError> {
         let mut request = request.clone();
         request["kind"] = json!("gaussians");
-        check_texts(texts_of(&request))?;
-        self.post("/v1/query", &request)
+        self.ask_for(&request)
+    }
+
+    fn ask_for<A: DeserializeOwned>(&self, request: &Value) -> Result<Reply<A>, RobotError> {
+        check_texts(request["texts"].as_array().into_iter().flatten().filter_map(Value::as_str))?;
+        self.post("/v1/query", request)
     }
 
     pub fn place(&self) -> Result<MapStatus, RobotError> {
-        self.get("/v1/map")
+        self.get("/v1/map", &[])
     }
 
     pub fn objects(&self, parameters: &[(&str, String)]) -> Result<ObjectPage, RobotError> {
-        self.get_with("/v1/objects", parameters)
+        self.get("/v1/objects", parameters)
     }
 
     /// Returns the number of things on board, or in a ball.
@@ -89,15 +92,15 @@ impl Robot {
     }
 
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<GoalReply, RobotError> {
-        self.get_with("/v1/goal", parameters)
+        self.get("/v1/goal", parameters)
     }
 
     pub fn changes(&self, parameters: &[(&str, String)]) -> Result<ChangesReply, RobotError> {
-        self.get_with("/v1/changes", parameters)
+        self.get("/v1/changes", parameters)
     }
 
     pub fn floor(&self, parameters: &[(&str, String)]) -> Result<Floor, RobotError> {
-        self.get_with("/v1/floor", parameters)
+        self.get("/v1/floor", parameters)
     }
 
     pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<locate::Answer, RobotError> {
@@ -117,15 +120,7 @@ impl Robot {
         self.post::<Value>("/position", position).map(drop)
     }
 
-    fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, RobotError> {
-        self.read(path, self.agent.get(self.address(path)).call())
-    }
-
-    fn get_with<T: DeserializeOwned>(
-        &self,
-        path: &str,
-        parameters: &[(&str, String)],
-    ) -> Result<T, RobotError> {
+    fn get<T: DeserializeOwned>(&self, path: &str, parameters: &[(&str, String)]) -> Result<T, RobotError> {
         let pairs = || parameters.iter().map(|(name, value)| (*name, value.as_str()));
         check_texts(pairs().filter_map(|(name, value)| (name == "text").then_some(value)))?;
         self.read(path, self.agent.get(self.address(path)).query_pairs(pairs()).call())
@@ -184,10 +179,6 @@ fn is_loopback(url: &str) -> bool {
     // The unspecified address reaches this machine.
     let is_here = |ip: IpAddr| ip.to_canonical().is_loopback() || ip.is_unspecified();
     host.eq_ignore_ascii_case("localhost") || host.parse().is_ok_and(is_here)
-}
-
-fn texts_of(request: &Value) -> impl Iterator<Item = &str> {
-    request["texts"].as_array().into_iter().flatten().filter_map(Value::as_str)
 }
 
 /// Refuses overlong texts already here: doors use their own token, on behalf of anybody.

@@ -7,7 +7,7 @@ use slag_common::objects::{parse_public_id, public_id};
 use super::choose::choose;
 use super::request::{GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings, no_places};
-use crate::query::{ClusterAnswer, Found, OnBoard, QueryError, QueryRequest, Scene, coverage};
+use crate::query::{ClusterAnswer, Found, OnBoard, QueryError, QueryRequest, Scene};
 use crate::score::{Budget, Region};
 
 const MAX_THINGS: usize = 5;
@@ -113,7 +113,7 @@ fn things(
             let found = scene.object(*id, None, budget);
             budget.check()?;
             let Some(object) = found else {
-                let missing = coverage(&scene, &Region::default()).missing();
+                let missing = scene.coverage(&Region::default()).missing();
                 let missing = missing.map(|missing| format!("; {missing}")).unwrap_or_default();
                 let (generation, id) = (scene.manifest.generation, public_id(*id));
                 return Ok(Err(format!("generation {generation} has no object {id} on board{missing}")));

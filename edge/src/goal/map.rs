@@ -23,7 +23,11 @@ pub struct FloorMap {
 }
 
 /// Maps the ground around a robot; the request's thing is ignored.
-pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) -> Result<FloorMap, QueryError> {
+pub fn floor_map(
+    snapshot: &Snapshot,
+    request: &GoalRequest,
+    budget: &Budget,
+) -> Result<FloorMap, QueryError> {
     request.check()?;
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
     let seen = Surroundings::look(snapshot, request, near, budget)?;

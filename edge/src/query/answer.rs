@@ -7,7 +7,6 @@ use rayon::prelude::*;
 
 use super::answers::{Answers, ClusterAnswer, Clustering, Found, Relations, Searched, Whole};
 use super::cluster::{Cluster, Clusters, Grouping, cluster};
-use super::coverage::coverage;
 use super::engine::QueryError;
 use super::objects::{self, FoundObject, ScoredObjects};
 use super::oriented::Extent;
@@ -175,7 +174,7 @@ impl Answering<'_> {
         });
         // With negatives a score is the difference of two products.
         let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
-        let measured = search.measured_errors();
+        let likely = search.likely_error();
         let empty = self.empty(asked, scale, (threshold, source));
         let reason = || reason::of_gaussians(search, scale, self.request, threshold, n_matching);
         Answers {
@@ -184,7 +183,7 @@ impl Answering<'_> {
                 n_matching,
                 is_exact: search.is_exact(),
                 score_error_bound,
-                score_error_likely: measured.map(|errors| scale.error_bound(n_products * errors.likely)),
+                score_error_likely: likely.map(|likely| scale.error_bound(n_products * likely)),
                 clustering,
                 ..empty.searched
             },
@@ -343,7 +342,7 @@ impl Answering<'_> {
             generation: manifest.generation,
             unit: unit(manifest),
             searched,
-            coverage: coverage(self.scene, &request.region),
+            coverage: self.scene.coverage(&request.region),
             asked_as: BTreeMap::new(),
             reason: None,
             answers: Found::Clusters(Vec::new()),

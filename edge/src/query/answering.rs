@@ -6,11 +6,10 @@ use std::sync::Arc;
 use slag_service::params::RequestError;
 
 use super::answer::{Answering, answer};
-use super::answers::Answers;
+use super::answers::{Answers, Reply};
 use super::ask::Ask;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::relations;
-use super::reply::Reply;
 use super::request::{Asked, QueryRequest, unit_vector};
 use super::scene::Scene;
 use crate::score::{Budget, Question};

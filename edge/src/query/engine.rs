@@ -236,12 +236,8 @@ fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions
         tracing::warn!("the scene's text model does not open: {}", crate::error_line(error));
     };
     let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
+    let read = read.and_then(|bytes| StoreError::check_hash(&path, expected, &bytes).map(|()| bytes));
     let bytes = read.inspect_err(|e| failed(e.is_damage(), e)).ok()?;
-    let found = Hash32::of(&bytes);
-    if found != expected {
-        failed(true, &StoreError::Hash { path, expected, found });
-        return None;
-    }
     let folder = path.parent().unwrap_or(cache.dir());
     let opened = ModelDir::carried(&bytes, &path, folder)
         .map_err(TextOpenError::Model)

@@ -14,7 +14,6 @@ use slag_common::objects::public_id;
 
 use super::answers::ClusterAnswer;
 use super::cluster::{Grouping, cluster};
-use super::coverage::coverage;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::names::Names;
 use super::objects::{self, FoundObject};
@@ -189,7 +188,7 @@ fn page(
         named: names.is_some(),
         n_objects: all.len(),
         next_after,
-        coverage: coverage(scene, &filter.region),
+        coverage: scene.coverage(&filter.region),
         objects,
     })
 }

@@ -9,7 +9,6 @@ mod arrow;
 mod ask;
 mod changes;
 pub mod cluster;
-mod coverage;
 mod engine;
 mod format;
 mod inventory;
@@ -23,7 +22,6 @@ mod ply;
 mod rank;
 mod reason;
 pub mod relations;
-mod reply;
 mod request;
 mod scale;
 mod scene;
@@ -31,11 +29,12 @@ mod status;
 mod view;
 
 pub use answer::answer;
-pub use answers::{Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Searched};
+pub use answers::{
+    Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Reply, Searched,
+};
 pub use area::{Area, AreaBall, AreaBox, Corner, LatLon, Point};
 pub use ask::Ask;
 pub use changes::{ChangesRequest, NO_SUCH_GENERATION};
-pub(crate) use coverage::coverage;
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
 pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder};
@@ -43,7 +42,6 @@ pub use listing::ListFormat;
 pub(crate) use naming::NAMES_WAIT;
 pub use page::Page;
 pub use reason::{Reason, ReasonKind};
-pub use reply::Reply;
 pub use request::{
     AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, LENGTHS, MAX_CLUSTERS,
     MAX_GAUSSIANS, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, Words,

@@ -26,10 +26,7 @@ pub struct Matches {
     /// Disjoint runs, by shard and start, ascending.
     pub runs: Vec<Run>,
     pub n_gaussians: u64,
-    pub n_centroids_undecided: u64,
     pub effort: Effort,
-    /// Shards without a centroid that can reach the threshold.
-    pub n_shards_below: usize,
 }
 
 /// Work done beyond scoring centroids.

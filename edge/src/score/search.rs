@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use rayon::prelude::*;
-use slag_common::shard::{ScoreErrors, ShardView};
+use slag_common::shard::ShardView;
 use slag_math::simd::InstructionSet;
 
 use super::budget::{Budget, ScoreError};
@@ -89,27 +89,21 @@ impl<'a> Search<'a> {
         self.shards.iter().zip(&*self.scored).filter_map(|(shard, scores)| scores.as_ref().map(|_| shard))
     }
 
-    /// Returns the score errors measured over a bank of texts, each the maximum over the shards searched, so that the
-    /// likely one holds for each; `None` if answers are exact, or a shard lacks measurements for the data read.
-    pub(crate) fn measured_errors(&self) -> Option<ScoreErrors> {
-        let mut largest: Option<ScoreErrors> = None;
+    /// Returns the likely score error measured over a bank of texts, the largest of the shards searched; `None` if
+    /// answers are exact, or a shard lacks measurements for the data read.
+    pub(crate) fn likely_error(&self) -> Option<f32> {
+        let mut largest = None;
         for shard in self.searched() {
             let of_codes = match self.precision {
                 Precision::Centroids => shard.residuals.is_none() && shard.exact.is_none(),
                 Precision::Measured => true,
                 Precision::Exact => shard.exact.is_none(),
             };
-            let errors = shard.header.errors;
-            if !of_codes || errors.likely == 0.0 {
+            let likely = shard.header.errors.likely;
+            if !of_codes || likely == 0.0 {
                 return None;
             }
-            let of = largest.unwrap_or(errors);
-            largest = Some(ScoreErrors {
-                mean: of.mean.max(errors.mean),
-                likely: of.likely.max(errors.likely),
-                max: of.max.max(errors.max),
-                spread: of.spread.max(errors.spread),
-            });
+            largest = Some(likely.max(largest.unwrap_or(0.0)));
         }
         largest
     }

@@ -48,6 +48,12 @@ impl Current {
     }
 }
 
+impl OldShard {
+    pub(crate) fn of_cell(self, cell_id: u32) -> CurrentCell {
+        CurrentCell { cell_id, hash: self.hash, len_bytes: self.len_bytes }
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentCell {
@@ -143,12 +149,8 @@ impl EdgeCache {
 
     pub fn read_manifest(&self, hash: Hash32) -> Result<Manifest, StoreError> {
         let path = self.manifest_path(hash);
-        let missing = StoreError::missing(&path);
-        let bytes = self.files.read(&path, manifest::MAX_BYTES).map_err(missing)?;
-        let found = Hash32::of(&bytes);
-        if found != hash {
-            return Err(StoreError::Hash { path, expected: hash, found });
-        }
+        let bytes = self.files.read(&path, manifest::MAX_BYTES).map_err(StoreError::missing(&path))?;
+        StoreError::check_hash(&path, hash, &bytes)?;
         Manifest::parse(&bytes).map_err(|source| StoreError::Manifest { path, source })
     }
 }

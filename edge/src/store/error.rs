@@ -45,6 +45,14 @@ impl From<io::Error> for StoreError {
 }
 
 impl StoreError {
+    /// Checks that bytes are those of a file named by their hash.
+    pub(crate) fn check_hash(path: &Path, expected: Hash32, bytes: &[u8]) -> Result<(), Self> {
+        match Hash32::of(bytes) {
+            found if found == expected => Ok(()),
+            found => Err(Self::Hash { path: path.to_owned(), expected, found }),
+        }
+    }
+
     /// Returns the error for what reading a file that must be there gave.
     pub(super) fn missing(path: &Path) -> impl Fn(io::Error) -> Self {
         move |e| match e.kind() {

@@ -32,6 +32,6 @@ pub use bad_cell::{BadCell, CellFault, OldShard, can_stand_in, cell_of};
 pub use cache::{Current, CurrentCell, EdgeCache};
 pub use error::StoreError;
 pub use scrubber::{Scrubbed, Scrubber};
-pub use shard::{OpenShard, check_file, check_shard};
+pub use shard::{Listed, OpenShard};
 pub use snapshot::Snapshot;
 pub(crate) use snapshot::beside_queries;

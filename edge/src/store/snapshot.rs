@@ -14,7 +14,7 @@ use super::damaged;
 use super::error::StoreError;
 use super::files::Stat;
 use super::objects::ObjectIndex;
-use super::shard::OpenShard;
+use super::shard::{Listed, OpenShard};
 
 /// Attempts of a reader while fetches replace `current`.
 const MAX_RACES: usize = 16;
@@ -132,21 +132,22 @@ struct Opener<'a> {
 impl Opener<'_> {
     fn open(&self, manifest: &Manifest, cell: &CurrentCell) -> Result<Arc<OpenShard>, StoreError> {
         let Self { cache, profile, .. } = *self;
+        let listed = Listed { manifest, profile, at: cell };
         if self.marked.contains(&cell.hash) {
             return Err(StoreError::Damaged { path: cache.shard_path(cell.hash) });
         }
         let held = self.held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id);
         let held = held.ok().map(|at| &self.held[at]);
-        match held.filter(|shard| shard.is(cache, manifest, profile, cell)) {
+        match held.filter(|shard| shard.is(cache, &listed)) {
             Some(shard) => Ok(Arc::clone(shard)),
-            None => OpenShard::open(cache, manifest, profile, cell).map(Arc::new),
+            None => listed.open(cache).map(Arc::new),
         }
     }
 
     /// Opens the shard of an earlier generation that answers for a bad cell.
     fn stand_in(&self, manifest: &Manifest, bad: &BadCell) -> Option<Arc<OpenShard>> {
         let old = bad.old?;
-        let cell = CurrentCell { cell_id: bad.cell_id, hash: old.hash, len_bytes: old.len_bytes };
+        let cell = old.of_cell(bad.cell_id);
         let opened = self.cache.read_manifest(old.manifest_hash).and_then(|of_old| {
             let may_stand_in = can_stand_in(&of_old, manifest, bad.cell_id);
             may_stand_in.then(|| self.open(&of_old, &cell)).transpose()
