@@ -131,7 +131,7 @@ async fn converse(
     let stream = Stalling::new(stream, at_most(limits.stall_timeout));
     let handshake = async {
         let stream: Box<dyn Stream> = match tls {
-            Some(tls) => Box::new(tls.acceptor().accept(stream).await?),
+            Some(tls) => Box::new(tls.0.accept(stream).await?),
             None => Box::new(stream),
         };
         Ok::<_, io::Error>(stream)

@@ -1,8 +1,11 @@
-//! A client of the robot.
+//! A client of the robot, and the flags of every door that select it.
 
+use std::io;
 use std::net::IpAddr;
+use std::path::PathBuf;
 use std::time::Duration;
 
+use clap::Args;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use slag_api::changes::ChangesReply;
@@ -11,6 +14,8 @@ use slag_api::goal::GoalReply;
 use slag_api::locate;
 use slag_api::map::MapStatus;
 use slag_api::objects::ObjectPage;
+use slag_common::files;
+use ureq::http::Uri;
 
 use crate::error::{MAX_TEXT_BYTES, RobotError};
 use crate::reply::{PointAnswer, Reply};
@@ -21,7 +26,36 @@ const MAX_REPLY_BYTES: u64 = 64 << 20;
 const MAX_ID_CHARS: usize = 40;
 const TIMEOUT: Duration = Duration::from_secs(20);
 
+/// More than any token that a robot accepts.
+const MAX_TOKEN_BYTES: u64 = 8192;
+
 type Response = Result<ureq::http::Response<ureq::Body>, ureq::Error>;
+
+/// The robot to ask.
+#[derive(Clone, Debug, Args)]
+pub struct RobotArgs {
+    /// Address of the robot's `slag-edge serve`.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT", value_parser = address)]
+    robot: String,
+    /// File with the token of the robot's --token-file.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+fn address(text: &str) -> Result<String, &'static str> {
+    let url = text.parse::<Uri>().ok().filter(|url| matches!(url.scheme_str(), Some("http" | "https")));
+    url.and_then(|url| url.host().map(|_| text.to_owned()))
+        .ok_or("expected http://HOST:PORT or https://HOST:PORT")
+}
+
+impl RobotArgs {
+    /// Returns the robot, with the file's token; sends nothing.
+    pub fn open(&self) -> io::Result<Robot> {
+        let read = |path: &PathBuf| io::read_to_string(&files::read_short(path, MAX_TOKEN_BYTES)?[..]);
+        let token = self.token_file.as_ref().map(read).transpose()?;
+        Ok(Robot::new(&self.robot, token.as_deref().map(str::trim)))
+    }
+}
 
 /// A robot's `slag-edge serve`. Calls block.
 #[derive(Clone, Debug)]
@@ -174,7 +208,7 @@ pub fn xyz([x, y, z]: [f64; 3]) -> String {
 }
 
 fn is_loopback(url: &str) -> bool {
-    let Ok(uri) = url.parse::<ureq::http::Uri>() else { return false };
+    let Ok(uri) = url.parse::<Uri>() else { return false };
     let host = uri.host().unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
     // The unspecified address reaches this machine.
     let is_here = |ip: IpAddr| ip.to_canonical().is_loopback() || ip.is_unspecified();

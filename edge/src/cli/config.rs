@@ -241,8 +241,8 @@ impl Settings<'_> {
         command.get_arguments().any(|other| is_given(other) && exclude(command, arg, other))
     }
 
-    /// Refuses a flag without another one that it requires. A flag for all commands is skipped instead if another
-    /// command accepts it alone: `radius` is a fetch's before it is a question's.
+    /// Refuses a flag without another one that it requires. A value for all commands does not count there: `radius` is
+    /// a fetch's before it is a question's.
     fn with_what_it_needs(
         &self,
         command: &Command,
@@ -255,7 +255,7 @@ impl Settings<'_> {
             });
             let Some((at, lacks)) = lacking else { return Ok(given) };
             let of = given.remove(at);
-            if of.rank.is_own || !self.stands_alone(command, &of) {
+            if of.rank.is_own {
                 let what = format!("needs {} as well; give it, or take this away", lacks.join(" and "));
                 return Err(wrong(&of.place, &what));
             }
@@ -274,16 +274,6 @@ impl Settings<'_> {
             command.get_arguments().any(|arg| arg.get_long() == flag && flag.is_some() && is_given(arg))
         };
         needs(command, arg, &of.values).into_iter().filter(|usage| !is_there(usage)).collect()
-    }
-
-    /// Returns whether another command's flag of this name accepts the values, without requiring others.
-    fn stands_alone(&self, command: &Command, of: &Given) -> bool {
-        let long = argument(command, &of.id).and_then(Arg::get_long);
-        let fits = |arg: &Arg| checked(arg, of.values.clone(), &of.place).is_ok();
-        with_those_below(&self.root).into_iter().any(|(_, command)| {
-            let mut same = flags(command).filter(|other| other.get_long() == long);
-            same.any(|arg| fits(arg) && needs(command, arg, &of.values).is_empty())
-        })
     }
 
     /// Returns a flag's value: the environment's, else the file's; its own command's, else that for all.

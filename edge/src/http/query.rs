@@ -18,9 +18,8 @@ use slag_service::replies::{As, Binary, Described, Reply};
 use tokio::sync::mpsc::{Sender, channel};
 
 use super::app::App;
-use super::ask::{AskParams, ShortParams};
+use super::ask::{AskParams, ShortParams, as_in_json};
 use super::forms::AreaParams;
-use super::named::as_in_json;
 use crate::query::{AnswersOrBatch, Ask, Format, Page, RequestError};
 
 /// Longest body: 32 vectors of 2048 components as text.

@@ -14,7 +14,7 @@ use super::relations;
 use super::request::{QueryRequest, RequestError, check_text};
 use crate::score::{OverBudget, ScoreError};
 use crate::store::files::Stat;
-use crate::store::{EdgeCache, Snapshot, StoreError, damaged};
+use crate::store::{EdgeCache, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextOpenError, TextService};
 
 /// Retry interval of a failed load while `current` is unchanged: disk full, too many open files.
@@ -256,7 +256,7 @@ fn mark_damaged(cache: &EdgeCache, record: &TextModelRecord) {
     for object in record.objects() {
         let read = cache.files().read(&cache.shard_path(object.hash), object.len_bytes);
         if !read.is_ok_and(|bytes| Hash32::of(&bytes) == object.hash) {
-            damaged::mark(cache, object.hash);
+            cache.mark_damaged(object.hash);
         }
     }
 }

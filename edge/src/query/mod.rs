@@ -1,7 +1,6 @@
 //! From a question to ranked answers.
 
 mod answer;
-mod answering;
 mod answers;
 mod area;
 #[cfg(feature = "arrow")]
@@ -19,7 +18,6 @@ mod objects;
 mod oriented;
 mod page;
 mod ply;
-mod rank;
 mod reason;
 pub mod relations;
 mod request;

@@ -8,9 +8,8 @@ use slag_common::shard::{BLOCK, Residuals, ShardView};
 
 use super::cell::{Cell, Detail, Measured};
 use super::dot::EmbeddingTimesVector;
-use super::matches::{Matches, Run};
 use super::region::Region;
-use super::search::{Search, combine};
+use super::search::{Matches, Run, Search, combine};
 use super::simd::{BlockSums, FindSums, LastBlock, RowsTimesVector};
 
 /// Number of bins; counting locates a rank's score before anything is sorted.

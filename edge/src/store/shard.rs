@@ -6,8 +6,7 @@ use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::shard::{Additions, Profile, ShardLayout, ShardView};
 
-use super::bad_cell::cell_of;
-use super::cache::{CurrentCell, EdgeCache};
+use super::cache::{CurrentCell, EdgeCache, cell_of};
 use super::error::StoreError;
 use super::files::Stat;
 use super::mmap::FileBytes;

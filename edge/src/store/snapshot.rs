@@ -8,9 +8,7 @@ use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 use slag_common::shard::Profile;
 
-use super::bad_cell::{BadCell, CellFault, can_stand_in};
-use super::cache::{Current, CurrentCell, EdgeCache};
-use super::damaged;
+use super::cache::{BadCell, CellFault, Current, CurrentCell, EdgeCache, can_stand_in};
 use super::error::StoreError;
 use super::files::Stat;
 use super::objects::ObjectIndex;
@@ -73,7 +71,7 @@ impl Snapshot {
     ) -> Result<Self, StoreError> {
         let manifest = cache.read_manifest(current.manifest_hash)?;
         let held = before.map_or(&[][..], |before| &before.shards);
-        let opener = Opener { cache, profile: current.profile, marked: damaged::marked(cache), held };
+        let opener = Opener { cache, profile: current.profile, marked: cache.marked_as_damaged(), held };
         let opened: Vec<Result<Arc<OpenShard>, StoreError>> =
             beside_queries(|| current.cells.par_iter().map(|cell| opener.open(&manifest, cell)).collect());
         let (mut shards, mut failures) = (Vec::with_capacity(opened.len()), Vec::new());
@@ -96,7 +94,7 @@ impl Snapshot {
         }
         for (cell, e) in &failures {
             if e.is_damage() {
-                damaged::mark(cache, cell.hash);
+                cache.mark_damaged(cell.hash);
             }
             tracing::warn!("cell {} does not answer: {}", cell.cell_id, crate::error_line(e));
             bad_cells.push(BadCell { cell_id: cell.cell_id, fault: CellFault::Unreadable, old: None });
