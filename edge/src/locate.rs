@@ -184,10 +184,7 @@ fn pose_of(snapshot: &Snapshot, located: &Located) -> Pose {
         optical_rotation_xyzw: rotation(world_from_camera.matrix3),
         covariance: located.covariance.to_vec(),
         n_inliers: located.n_inliers,
-        verified_by: match located.is_verified {
-            true => Verification::Rendering,
-            false => Verification::Landmarks,
-        },
+        verified_by: if located.is_verified { Verification::Rendering } else { Verification::Landmarks },
         geographic: snapshot.manifest.geo_reference.map(|geo| geo.geographic_from_world(at)),
     }
 }

@@ -89,5 +89,5 @@ pub async fn serve(
         stop.await;
         stopping.stopping.send_replace(true);
     };
-    Ok(listener::serve(router(app), listener, limits, stop).await?)
+    listener::serve(router(app), listener, limits, stop).await
 }

@@ -13,7 +13,6 @@ mod format;
 mod inventory;
 mod listing;
 mod names;
-mod naming;
 mod objects;
 mod oriented;
 mod page;
@@ -35,9 +34,9 @@ pub use ask::Ask;
 pub use changes::{ChangesRequest, NO_SUCH_GENERATION};
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
+pub(crate) use inventory::NAMES_WAIT;
 pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder};
 pub use listing::ListFormat;
-pub(crate) use naming::NAMES_WAIT;
 pub use page::Page;
 pub use reason::{Reason, ReasonKind};
 pub use request::{

@@ -93,10 +93,7 @@ pub fn is_length(length: f64) -> bool {
 
 /// Checks a length. `parameter`: its name, for the error.
 pub fn check_length(parameter: &str, length: f64) -> Result<(), RequestError> {
-    match is_length(length) {
-        true => Ok(()),
-        false => Err(RequestError::new(parameter, &length.to_string(), LENGTHS)),
-    }
+    if is_length(length) { Ok(()) } else { Err(RequestError::new(parameter, &length.to_string(), LENGTHS)) }
 }
 
 fn is_within(point: DVec3) -> bool {

@@ -8,7 +8,7 @@ use slag_view::{
 };
 
 use super::engine::{Engine, QueryError};
-use super::naming::NAMES_WAIT;
+use super::inventory::NAMES_WAIT;
 use super::request::{Negatives, QueryRequest};
 use super::scene::Scene;
 use super::status::map_status;

@@ -86,10 +86,9 @@ impl<'a> Listed<'a> {
         let Self { manifest, profile, at } = *self;
         let same = |field, expected: &dyn ToString, found: &dyn ToString| {
             let (expected, found) = (expected.to_string(), found.to_string());
-            match expected == found {
-                true => Ok(()),
-                false => Err(StoreError::Mismatch { path: path.to_owned(), field, expected, found }),
-            }
+            let what = format!("{field} is {found}, the manifest says {expected}");
+            let wrong = || StoreError::Wrong { path: path.to_owned(), what };
+            if expected == found { Ok(()) } else { Err(wrong()) }
         };
         let cell = cell_of(manifest, at.cell_id);
         let Some((cell, listed)) = cell.and_then(|cell| Some((cell, cell.shards.get(&profile)?))) else {
