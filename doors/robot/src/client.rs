@@ -17,11 +17,13 @@ use slag_api::objects::ObjectPage;
 use slag_common::files;
 use ureq::http::Uri;
 
-use crate::error::{MAX_TEXT_BYTES, RobotError};
+use crate::error::RobotError;
 use crate::reply::{PointAnswer, Reply};
 
 /// Longest reply read: ten thousand answers are 10 MB.
 const MAX_REPLY_BYTES: u64 = 64 << 20;
+/// Longest text that a robot takes.
+const MAX_TEXT_BYTES: usize = 512;
 /// Most characters of an invalid id in an error.
 const MAX_ID_CHARS: usize = 40;
 const TIMEOUT: Duration = Duration::from_secs(20);
@@ -119,7 +121,9 @@ impl Robot {
     /// Returns the thumbnail of a thing, a JPEG file.
     pub fn thumbnail(&self, id: &str) -> Result<Vec<u8>, RobotError> {
         if !id.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
-            return Err(RobotError::NoId { id: id.chars().take(MAX_ID_CHARS).collect() });
+            let id: String = id.chars().take(MAX_ID_CHARS).collect();
+            let advice = "give one that the robot named, such as o00d1f3a5b7c9e0d2";
+            return Err(RobotError::Refused(format!("{id:?} is no id of a thing; {advice}")));
         }
         let path = format!("/v1/objects/{id}/thumbnail");
         self.read_bytes(&path, self.agent.get(self.address(&path)).call())
@@ -182,8 +186,10 @@ impl Robot {
 
     fn read<T: DeserializeOwned>(&self, path: &str, response: Response) -> Result<T, RobotError> {
         let body = self.read_bytes(path, response)?;
-        let foreign = |cause: serde_json::Error| RobotError::Foreign { url: self.address(path), cause };
-        serde_json::from_slice(&body).map_err(foreign)
+        serde_json::from_slice(&body).map_err(|cause| {
+            let (url, advice) = (self.address(path), "see that --robot names a slag-edge of this version");
+            RobotError::Refused(format!("{url} answers, but not as slag-edge does: {cause}; {advice}"))
+        })
     }
 
     fn read_bytes(&self, path: &str, response: Response) -> Result<Vec<u8>, RobotError> {
@@ -218,7 +224,10 @@ fn is_loopback(url: &str) -> bool {
 /// Refuses overlong texts already here: doors use their own token, on behalf of anybody.
 fn check_texts<'a>(mut texts: impl Iterator<Item = &'a str>) -> Result<(), RobotError> {
     match texts.find(|text| text.len() > MAX_TEXT_BYTES) {
-        Some(text) => Err(RobotError::TooLong { n_bytes: text.len() }),
+        Some(text) => Err(RobotError::Refused(format!(
+            "a text has {} bytes, expected at most {MAX_TEXT_BYTES}; name the thing in a few words",
+            text.len()
+        ))),
         None => Ok(()),
     }
 }
@@ -266,7 +275,7 @@ mod tests {
             robot.changes(&[("text", long)]).map(drop),
         ];
         for refused in refused {
-            assert!(matches!(refused, Err(RobotError::TooLong { n_bytes: 45_000 })), "{refused:?}");
+            assert!(refused.expect_err("too long").to_string().starts_with("a text has 45000 bytes"));
         }
     }
 }

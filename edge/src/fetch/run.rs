@@ -84,7 +84,8 @@ impl<'a> Fetch<'a> {
                     None => ("store address", "give one with --from URL"),
                     Some(_) => ("position", "give one with --at X,Y,Z or --at-geo LAT,LON"),
                 };
-                return Err(FetchError::NotGiven { what, advice });
+                let what = format!("no {what} is given, and no earlier fetch recorded one; {advice}");
+                return Err(FetchError::Request(what));
             }
         };
         let current = match cache.current() {

@@ -60,19 +60,17 @@ struct Described<'a> {
     answers: Vec<Answer<'a>>,
 }
 
-/// A question as the client wrote it: one of the members.
-#[derive(Default, Serialize, JsonSchema)]
+/// A question as the client wrote it.
+#[derive(Serialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
 #[schemars(rename = "Question")]
-struct AskedFor<'a> {
+enum AskedFor<'a> {
     /// A text.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    text: Option<&'a str>,
+    Text(&'a str),
     /// The index of a vector in the request.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    vector: Option<usize>,
+    Vector(usize),
     /// A phrase.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    phrase: Option<&'a Phrase>,
+    Phrase(&'a Phrase),
 }
 
 /// Why nothing was found.
@@ -149,24 +147,14 @@ impl<'a> Page<'a> {
     }
 }
 
-impl<'a> AskedFor<'a> {
-    /// Returns a question, and the phrase that it was understood as.
-    fn new(asked: &'a Asked) -> (Self, Option<&'a Phrase>) {
-        let of_text = |text| Self { text: Some(text), ..Self::default() };
-        match asked {
-            Asked::Text(text) => (of_text(text), None),
-            Asked::Vector { at, .. } => (Self { vector: Some(*at), ..Self::default() }, None),
-            Asked::Phrase { text: Some(text), phrase } => (of_text(text), Some(phrase)),
-            Asked::Phrase { text: None, phrase } => {
-                (Self { phrase: Some(phrase), ..Self::default() }, Some(phrase))
-            }
-        }
-    }
-}
-
 impl<'a> Described<'a> {
     fn new(reply: &Reply, asked: &'a Asked, found: &'a Answers) -> Self {
-        let (question, understood) = AskedFor::new(asked);
+        let (question, understood) = match asked {
+            Asked::Text(text) => (AskedFor::Text(text), None),
+            Asked::Vector { at, .. } => (AskedFor::Vector(*at), None),
+            Asked::Phrase { text: Some(text), phrase } => (AskedFor::Text(text), Some(phrase)),
+            Asked::Phrase { text: None, phrase } => (AskedFor::Phrase(phrase), Some(phrase)),
+        };
         let (offset, limit) = (reply.request.offset, reply.request.page());
         let end = offset.saturating_add(limit);
         let generation = reply.manifest().generation;

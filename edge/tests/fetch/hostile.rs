@@ -173,8 +173,8 @@ fn addresses_that_are_none_are_refused() {
     let none =
         " store /etc/passwd file:///etc/passwd ftp://host http:// http://a@b http://a/?q=1 http://a/#f";
     for from in none.split(' ') {
-        let error = Robot::on_disk(dir.path(), from).fetch().expect_err("refused");
-        assert!(matches!(error, FetchError::Address { .. }), "{from}: {error}");
+        let error = Robot::on_disk(dir.path(), from).fetch().expect_err("refused").to_string();
+        assert!(error.contains("is not the address of a store"), "{from}: {error}");
     }
     let mut robot = Robot::on_disk(dir.path(), "http://a");
     robot.request.from = None;
