@@ -11,7 +11,6 @@ mod goal;
 mod list;
 mod locate;
 mod models;
-mod network;
 mod output;
 mod progress;
 mod query;

@@ -10,6 +10,7 @@ use slag_common::{Intrinsics, pinhole};
 use slag_locate::{
     CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, Renderer, locate, map_bytes, working_bytes,
 };
+use slag_service::params::RequestError;
 
 use self::render::OnBoard;
 use crate::score::Budget;
@@ -26,20 +27,20 @@ const MIN_GRAVITY: f64 = 1e-6;
 
 #[derive(Debug, thiserror::Error)]
 pub enum LocateError {
-    #[error("no photo: {0}")]
-    Photo(#[from] PhotoError),
-    #[error("nothing of the photo is seen: it is transparent; give another copy")]
-    Blank,
-    #[error(
-        "the photo has {width} x {height} pixels, expected at most {MAX_SIDE_PX} a side and {MAX_PX} in all"
-    )]
-    TooLarge { width: u32, height: u32 },
-    #[error("{parameter}: found {found}, expected {expected}")]
-    Camera { parameter: &'static str, found: String, expected: String },
+    #[error("{0}")]
+    Photo(String),
+    #[error(transparent)]
+    Camera(#[from] RequestError),
     #[error(
         "cell {cell_id} has landmarks of version {found}, this program matches version {CODE_VERSION}; use a program of the matching version, or encode again"
     )]
     Version { cell_id: u32, found: u32 },
+}
+
+impl From<PhotoError> for LocateError {
+    fn from(error: PhotoError) -> Self {
+        Self::Photo(format!("no photo: {error}"))
+    }
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -66,7 +67,9 @@ impl<'a> PhotoFile<'a> {
         let decoder = photo::open(Cursor::new(bytes))?;
         let (width, height) = decoder.dimensions();
         if width.max(height) > MAX_SIDE_PX || u64::from(width) * u64::from(height) > MAX_PX {
-            return Err(LocateError::TooLarge { width, height });
+            return Err(LocateError::Photo(format!(
+                "the photo has {width} x {height} pixels, expected at most {MAX_SIDE_PX} a side and {MAX_PX} in all"
+            )));
         }
         Ok(Self { decoder })
     }
@@ -89,7 +92,8 @@ impl<'a> PhotoFile<'a> {
         let decoded = DynamicImage::from_decoder(self.decoder).map_err(PhotoError::from)?;
         let (rgb, opaque) = photo::colours(decoded);
         if opaque.is_some_and(|opaque| !opaque.contains(&true)) {
-            return Err(LocateError::Blank);
+            let what = "nothing of the photo is seen: it is transparent; give another copy";
+            return Err(LocateError::Photo(what.to_owned()));
         }
         Ok(Grey::from_rgb8(rgb.width() as usize, rgb.height() as usize, rgb.as_raw()))
     }
@@ -132,14 +136,14 @@ pub fn answer(
     if !((0.0..=width).contains(&centre_x_px) && (0.0..=height).contains(&centre_y_px)) {
         let expected = format!("a point of the photo, which has {width} x {height} pixels");
         let found = format!("{centre_x_px},{centre_y_px}");
-        return Err(LocateError::Camera { parameter: "centre_px", found, expected });
+        return Err(RequestError::new("centre_px", &found, expected).into());
     }
     // The squares of very short ones are 0: they would contradict nothing.
     let is_direction = |gravity: &DVec3| (MIN_GRAVITY..f64::INFINITY).contains(&gravity.length());
     if let Some(gravity) = camera.gravity.filter(|gravity| !is_direction(gravity)) {
         let expected = format!("a direction, {MIN_GRAVITY} or longer");
         let found = gravity.to_array().map(|v| v.to_string()).join(",");
-        return Err(LocateError::Camera { parameter: "gravity", found, expected });
+        return Err(RequestError::new("gravity", &found, expected).into());
     }
     let intrinsics = Intrinsics {
         centre_x_px,
@@ -180,10 +184,7 @@ fn pose_of(snapshot: &Snapshot, located: &Located) -> Pose {
         optical_rotation_xyzw: rotation(world_from_camera.matrix3),
         covariance: located.covariance.to_vec(),
         n_inliers: located.n_inliers,
-        verified_by: match located.is_verified {
-            true => Verification::Rendering,
-            false => Verification::Landmarks,
-        },
+        verified_by: if located.is_verified { Verification::Rendering } else { Verification::Landmarks },
         geographic: snapshot.manifest.geo_reference.map(|geo| geo.geographic_from_world(at)),
     }
 }

@@ -236,10 +236,6 @@ impl Cache {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
-    use slag_test_support::needs_shared;
-
     use super::*;
     use crate::testing::{Axes, Gate, axes_service, open_gate};
 
@@ -285,23 +281,6 @@ mod tests {
         });
         assert!(n_turned_away > 0);
         assert!(service.encode("wait").is_ok());
-    }
-
-    #[needs_shared]
-    #[test]
-    fn described_phrase_lists_open() {
-        let options = SessionOptions::new("no-runtime-needed".into());
-        let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/models/conse");
-        let phrases =
-            TextService::open(&ModelDir::open(&models).expect("described"), &options).expect("described");
-        let (chair, stool, tree) =
-            (phrases.encode("a chair"), phrases.encode("stool"), phrases.encode("tree"));
-        let (chair, stool, tree) = (chair.expect("known"), stool.expect("known"), tree.expect("known"));
-        let cosine = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
-        assert!(
-            (cosine(&chair, &chair) - 1.0).abs() < 1e-4 && cosine(&chair, &stool) > cosine(&chair, &tree)
-        );
-        assert_eq!(phrases.info().execution_provider, "none");
     }
 
     /// Symbols beside words are ignored; a text without words is an error.

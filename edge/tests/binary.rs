@@ -82,9 +82,12 @@ fn serve(cache: &Path, args: &[&str]) -> (Child, String) {
     (serving, url)
 }
 
+fn signal(program: &Child, name: &str) {
+    assert!(Command::new("kill").args([name, &program.id().to_string()]).status().expect("runs").success());
+}
+
 fn stop(mut serving: Child) -> String {
-    let killed = Command::new("kill").args(["-TERM", &serving.id().to_string()]).status().expect("runs");
-    assert!(killed.success());
+    signal(&serving, "-TERM");
     assert_eq!(serving.wait().expect("ends").code(), Some(0));
     let mut log = String::new();
     serving.stderr.take().expect("a pipe").read_to_string(&mut log).expect("text");
@@ -185,13 +188,10 @@ fn a_supervisor_hears_of_start_life_and_stop() {
     serving.env("NOTIFY_SOCKET", dir.path().join("notify")).env("WATCHDOG_USEC", "30000");
     let mut serving = serving.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("runs");
     assert_eq!([heard(), heard()], ["READY=1", "WATCHDOG=1"]);
-    assert!(
-        Command::new("kill").args(["-TERM", &serving.id().to_string()]).status().expect("runs").success()
-    );
-    assert!(
-        std::iter::repeat_with(heard)
-            .find(|word| word != "WATCHDOG=1")
-            .is_some_and(|word| word == "STOPPING=1")
+    signal(&serving, "-TERM");
+    assert_eq!(
+        std::iter::repeat_with(heard).find(|word| word != "WATCHDOG=1").as_deref(),
+        Some("STOPPING=1")
     );
     assert_eq!(serving.wait().expect("ends").code(), Some(0));
 }
@@ -206,8 +206,7 @@ fn an_interrupted_fetch_says_so() {
     let fetching = fetching.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
     // The signal handler is installed before it connects. Closing the connection makes it retry and check the flag.
     let (connection, _) = silent.accept().expect("a connection");
-    let interrupted = Command::new("kill").args(["-INT", &fetching.id().to_string()]).status().expect("runs");
-    assert!(interrupted.success());
+    signal(&fetching, "-INT");
     drop(connection);
     let output = fetching.wait_with_output().expect("ends");
     assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8_lossy(&output.stderr));
@@ -277,10 +276,8 @@ fn a_robot_is_followed_by_its_service() {
         let ((code, answers), (_, status)) =
             (get(&format!("{url}/query?text=blue")), get(&format!("{url}/status")));
         if code == 200 && status["following"]["n_fetches"] == 1 {
-            assert_eq!(
-                (&answers["answers"][0]["n_gaussians"], &status["is_expired"]),
-                (&60.into(), &false.into())
-            );
+            assert_eq!(answers["answers"][0]["n_gaussians"], 60);
+            assert_eq!(status["is_expired"], false);
             break;
         }
         assert!(Instant::now() < give_up, "the scene does not come in: {status}");

@@ -62,26 +62,16 @@ impl Default for ConnectionLimits {
     }
 }
 
-/// The drain deadline passed before all requests were answered.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("requests still in progress {} s after the stop were cut off", after.as_secs_f64())]
-pub struct CutOff {
-    pub after: Duration,
-}
-
-impl From<CutOff> for io::Error {
-    fn from(error: CutOff) -> Self {
-        Self::new(io::ErrorKind::TimedOut, error)
-    }
-}
-
 /// Serves until `stop` completes, then lets requests in progress finish within the drain deadline.
+///
+/// # Errors
+/// [`io::ErrorKind::TimedOut`] when the deadline cut requests off.
 pub async fn serve(
     router: Router,
     listener: impl Into<Listener>,
     limits: ConnectionLimits,
     stop: impl Future<Output = ()>,
-) -> Result<(), CutOff> {
+) -> io::Result<()> {
     let listener = listener.into();
     let tls = listener.tls.clone();
     let permits = Permits::new(limits.n_connections, limits.n_per_peer, limits.n_reserved);
@@ -105,7 +95,11 @@ pub async fn serve(
     }
     drop(listener);
     let drained = tokio::time::timeout(limits.drain_timeout, graceful.shutdown()).await;
-    drained.map_err(|_| CutOff { after: limits.drain_timeout })
+    drained.map_err(|_| {
+        let after = limits.drain_timeout.as_secs_f64();
+        let what = format!("requests still in progress {after} s after the stop were cut off");
+        io::Error::new(io::ErrorKind::TimedOut, what)
+    })
 }
 
 async fn converse(
@@ -131,7 +125,7 @@ async fn converse(
     let stream = Stalling::new(stream, at_most(limits.stall_timeout));
     let handshake = async {
         let stream: Box<dyn Stream> = match tls {
-            Some(tls) => Box::new(tls.acceptor().accept(stream).await?),
+            Some(tls) => Box::new(tls.0.accept(stream).await?),
             None => Box::new(stream),
         };
         Ok::<_, io::Error>(stream)

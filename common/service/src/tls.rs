@@ -47,7 +47,7 @@ struct Certificate {
 }
 
 #[derive(Clone)]
-pub struct Tls(TlsAcceptor);
+pub struct Tls(pub(crate) TlsAcceptor);
 
 impl fmt::Debug for Tls {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -63,10 +63,6 @@ impl Tls {
         let certificate = Arc::new(Certificate { files, provider: Arc::clone(&provider), state });
         let config = versions(provider).with_no_client_auth().with_cert_resolver(certificate);
         Ok(Self(TlsAcceptor::from(Arc::new(config))))
-    }
-
-    pub(crate) fn acceptor(&self) -> &TlsAcceptor {
-        &self.0
     }
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use slag_robot::{Answer, Reply, Results};
+use slag_robot::{Answer, Nothing, Reply, Results, Witness};
 
 /// Default number of things in an answer: a model reads every one.
 const DEFAULT_LIMIT: u32 = 5;
@@ -81,28 +81,7 @@ pub struct Thing {
     /// What the relation holds with.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[schemars(default)]
-    pub related_to: Vec<Related>,
-}
-
-/// The other thing of a relation.
-#[derive(Debug, Serialize, JsonSchema)]
-pub struct Related {
-    /// Its words.
-    pub thing: String,
-    /// Its id; absent for the asker.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub id: Option<String>,
-    /// Its middle.
-    pub position_in_world: [f64; 3],
-}
-
-/// Why nothing was found.
-#[derive(Debug, Serialize, JsonSchema)]
-pub struct Nothing {
-    /// "below-threshold", "no-such-thing", "no-such-pair", "too-few", "not-in-region", "not-looked-there" or others.
-    pub kind: String,
-    /// The same in a sentence.
-    pub detail: String,
+    pub related_to: Vec<Witness>,
 }
 
 impl Wanted {
@@ -142,18 +121,13 @@ impl Found {
             asked_as,
             things: answers.into_iter().map(Thing::from).collect(),
             more: next_offset.is_some(),
-            none: none.map(|none| Nothing { kind: none.kind, detail: none.detail }),
+            none,
         })
     }
 }
 
 impl From<Answer> for Thing {
     fn from(answer: Answer) -> Self {
-        let related = answer.related_to.into_iter().map(|to| Related {
-            thing: to.thing,
-            id: to.id,
-            position_in_world: to.position_in_world,
-        });
         Self {
             id: answer.id,
             position_in_world: answer.position_in_world,
@@ -162,7 +136,7 @@ impl From<Answer> for Thing {
             distance: answer.distance,
             lat_lon_deg: answer.geographic.map(|place| [place.latitude_deg, place.longitude_deg]),
             degree: answer.degree,
-            related_to: related.collect(),
+            related_to: answer.related_to,
         }
     }
 }

@@ -1,16 +1,19 @@
 //! The tools.
 
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use rmcp::handler::server::router::tool::ToolRouter;
 use rmcp::handler::server::wrapper::Parameters;
 use rmcp::model::{ContentBlock, Implementation, ServerCapabilities, ServerConfig};
+use rmcp::schemars::{self, JsonSchema};
 use rmcp::{Json, ServerHandler, tool, tool_handler, tool_router};
+use serde::Deserialize;
 use slag_robot::Robot;
 
 use crate::changes::{Compare, Difference};
 use crate::find::{Found, Wanted};
 use crate::list::{Listed, Listing};
 use crate::locate::{Places, Seen};
-use crate::picture::Shown;
 use crate::place::{Asked, Description};
 use crate::stand::{Going, Stands};
 
@@ -19,6 +22,15 @@ const INSTRUCTIONS: &str = "Answers where things are on the robot's map of its s
     have moved since. Ask describe_place first if you do not know how large the map is, and list if you do not know what \
     is there; ask find for each thing, and where_to_stand before going to one. Names in a list are guesses with their \
     chances.";
+
+/// Which thing is shown.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+struct Shown {
+    /// `id` of a thing that `find` or `list` gave.
+    #[schemars(regex(pattern = "^o[0-9a-f]{16}$"))]
+    id: String,
+}
 
 #[derive(Clone, Debug)]
 pub struct Tools {
@@ -50,7 +62,8 @@ impl Tools {
     /// Show a thing of the robot's map as the best photo of it has it. Some maps carry no pictures.
     #[tool(annotations(title = "Picture of a thing", read_only_hint = true, open_world_hint = false))]
     async fn picture(&self, Parameters(shown): Parameters<Shown>) -> Result<ContentBlock, String> {
-        self.blocking(move |robot| shown.picture(robot)).await.map(|Json(picture)| picture)
+        let Json(jpeg) = self.blocking(move |robot| robot.thumbnail(&shown.id)).await?;
+        Ok(ContentBlock::image(BASE64_STANDARD.encode(jpeg), "image/jpeg"))
     }
 
     /// Find where the robot can stand near a thing: places that it reaches, has room at, and sees the thing from,

@@ -1,8 +1,11 @@
-//! A client of the robot.
+//! A client of the robot, and the flags of every door that select it.
 
+use std::io;
 use std::net::IpAddr;
+use std::path::PathBuf;
 use std::time::Duration;
 
+use clap::Args;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use slag_api::changes::ChangesReply;
@@ -11,17 +14,50 @@ use slag_api::goal::GoalReply;
 use slag_api::locate;
 use slag_api::map::MapStatus;
 use slag_api::objects::ObjectPage;
+use slag_common::files;
+use ureq::http::Uri;
 
-use crate::error::{MAX_TEXT_BYTES, RobotError};
+use crate::error::RobotError;
 use crate::reply::{PointAnswer, Reply};
 
 /// Longest reply read: ten thousand answers are 10 MB.
 const MAX_REPLY_BYTES: u64 = 64 << 20;
+/// Longest text that a robot takes.
+const MAX_TEXT_BYTES: usize = 512;
 /// Most characters of an invalid id in an error.
 const MAX_ID_CHARS: usize = 40;
 const TIMEOUT: Duration = Duration::from_secs(20);
 
+/// More than any token that a robot accepts.
+const MAX_TOKEN_BYTES: u64 = 8192;
+
 type Response = Result<ureq::http::Response<ureq::Body>, ureq::Error>;
+
+/// The robot to ask.
+#[derive(Clone, Debug, Args)]
+pub struct RobotArgs {
+    /// Address of the robot's `slag-edge serve`.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT", value_parser = address)]
+    robot: String,
+    /// File with the token of the robot's --token-file.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+fn address(text: &str) -> Result<String, &'static str> {
+    let url = text.parse::<Uri>().ok().filter(|url| matches!(url.scheme_str(), Some("http" | "https")));
+    url.and_then(|url| url.host().map(|_| text.to_owned()))
+        .ok_or("expected http://HOST:PORT or https://HOST:PORT")
+}
+
+impl RobotArgs {
+    /// Returns the robot, with the file's token; sends nothing.
+    pub fn open(&self) -> io::Result<Robot> {
+        let read = |path: &PathBuf| io::read_to_string(&files::read_short(path, MAX_TOKEN_BYTES)?[..]);
+        let token = self.token_file.as_ref().map(read).transpose()?;
+        Ok(Robot::new(&self.robot, token.as_deref().map(str::trim)))
+    }
+}
 
 /// A robot's `slag-edge serve`. Calls block.
 #[derive(Clone, Debug)]
@@ -50,24 +86,27 @@ impl Robot {
 
     /// Posts a request to `/v1/query`.
     pub fn ask(&self, request: &Value) -> Result<Reply, RobotError> {
-        check_texts(texts_of(request))?;
-        self.post("/v1/query", request)
+        self.ask_for(request)
     }
 
     /// As [`Self::ask`], for matching Gaussians.
     pub fn ask_points(&self, request: &Value) -> Result<Reply<PointAnswer>, RobotError> {
         let mut request = request.clone();
         request["kind"] = json!("gaussians");
-        check_texts(texts_of(&request))?;
-        self.post("/v1/query", &request)
+        self.ask_for(&request)
+    }
+
+    fn ask_for<A: DeserializeOwned>(&self, request: &Value) -> Result<Reply<A>, RobotError> {
+        check_texts(request["texts"].as_array().into_iter().flatten().filter_map(Value::as_str))?;
+        self.post("/v1/query", request)
     }
 
     pub fn place(&self) -> Result<MapStatus, RobotError> {
-        self.get("/v1/map")
+        self.get("/v1/map", &[])
     }
 
     pub fn objects(&self, parameters: &[(&str, String)]) -> Result<ObjectPage, RobotError> {
-        self.get_with("/v1/objects", parameters)
+        self.get("/v1/objects", parameters)
     }
 
     /// Returns the number of things on board, or in a ball.
@@ -82,22 +121,24 @@ impl Robot {
     /// Returns the thumbnail of a thing, a JPEG file.
     pub fn thumbnail(&self, id: &str) -> Result<Vec<u8>, RobotError> {
         if !id.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
-            return Err(RobotError::NoId { id: id.chars().take(MAX_ID_CHARS).collect() });
+            let id: String = id.chars().take(MAX_ID_CHARS).collect();
+            let advice = "give one that the robot named, such as o00d1f3a5b7c9e0d2";
+            return Err(RobotError::Refused(format!("{id:?} is no id of a thing; {advice}")));
         }
         let path = format!("/v1/objects/{id}/thumbnail");
         self.read_bytes(&path, self.agent.get(self.address(&path)).call())
     }
 
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<GoalReply, RobotError> {
-        self.get_with("/v1/goal", parameters)
+        self.get("/v1/goal", parameters)
     }
 
     pub fn changes(&self, parameters: &[(&str, String)]) -> Result<ChangesReply, RobotError> {
-        self.get_with("/v1/changes", parameters)
+        self.get("/v1/changes", parameters)
     }
 
     pub fn floor(&self, parameters: &[(&str, String)]) -> Result<Floor, RobotError> {
-        self.get_with("/v1/floor", parameters)
+        self.get("/v1/floor", parameters)
     }
 
     pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<locate::Answer, RobotError> {
@@ -117,15 +158,7 @@ impl Robot {
         self.post::<Value>("/position", position).map(drop)
     }
 
-    fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, RobotError> {
-        self.read(path, self.agent.get(self.address(path)).call())
-    }
-
-    fn get_with<T: DeserializeOwned>(
-        &self,
-        path: &str,
-        parameters: &[(&str, String)],
-    ) -> Result<T, RobotError> {
+    fn get<T: DeserializeOwned>(&self, path: &str, parameters: &[(&str, String)]) -> Result<T, RobotError> {
         let pairs = || parameters.iter().map(|(name, value)| (*name, value.as_str()));
         check_texts(pairs().filter_map(|(name, value)| (name == "text").then_some(value)))?;
         self.read(path, self.agent.get(self.address(path)).query_pairs(pairs()).call())
@@ -153,8 +186,10 @@ impl Robot {
 
     fn read<T: DeserializeOwned>(&self, path: &str, response: Response) -> Result<T, RobotError> {
         let body = self.read_bytes(path, response)?;
-        let foreign = |cause: serde_json::Error| RobotError::Foreign { url: self.address(path), cause };
-        serde_json::from_slice(&body).map_err(foreign)
+        serde_json::from_slice(&body).map_err(|cause| {
+            let (url, advice) = (self.address(path), "see that --robot names a slag-edge of this version");
+            RobotError::Refused(format!("{url} answers, but not as slag-edge does: {cause}; {advice}"))
+        })
     }
 
     fn read_bytes(&self, path: &str, response: Response) -> Result<Vec<u8>, RobotError> {
@@ -179,21 +214,20 @@ pub fn xyz([x, y, z]: [f64; 3]) -> String {
 }
 
 fn is_loopback(url: &str) -> bool {
-    let Ok(uri) = url.parse::<ureq::http::Uri>() else { return false };
+    let Ok(uri) = url.parse::<Uri>() else { return false };
     let host = uri.host().unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
     // The unspecified address reaches this machine.
     let is_here = |ip: IpAddr| ip.to_canonical().is_loopback() || ip.is_unspecified();
     host.eq_ignore_ascii_case("localhost") || host.parse().is_ok_and(is_here)
 }
 
-fn texts_of(request: &Value) -> impl Iterator<Item = &str> {
-    request["texts"].as_array().into_iter().flatten().filter_map(Value::as_str)
-}
-
 /// Refuses overlong texts already here: doors use their own token, on behalf of anybody.
 fn check_texts<'a>(mut texts: impl Iterator<Item = &'a str>) -> Result<(), RobotError> {
     match texts.find(|text| text.len() > MAX_TEXT_BYTES) {
-        Some(text) => Err(RobotError::TooLong { n_bytes: text.len() }),
+        Some(text) => Err(RobotError::Refused(format!(
+            "a text has {} bytes, expected at most {MAX_TEXT_BYTES}; name the thing in a few words",
+            text.len()
+        ))),
         None => Ok(()),
     }
 }
@@ -241,7 +275,7 @@ mod tests {
             robot.changes(&[("text", long)]).map(drop),
         ];
         for refused in refused {
-            assert!(matches!(refused, Err(RobotError::TooLong { n_bytes: 45_000 })), "{refused:?}");
+            assert!(refused.expect_err("too long").to_string().starts_with("a text has 45000 bytes"));
         }
     }
 }

@@ -2,25 +2,15 @@
 
 use serde_json::Value;
 
-/// Longest text that a robot takes.
-pub(crate) const MAX_TEXT_BYTES: usize = 512;
-
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {
     #[error(
         "{url} does not answer: {cause}; start `slag-edge serve` there, or give its address with --robot"
     )]
     Unreachable { url: String, cause: Box<ureq::Error> },
-    #[error("the robot refused ({status}): {detail}")]
-    Refused { status: u16, detail: String },
-    #[error("a text has {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}; name the thing in a few words")]
-    TooLong { n_bytes: usize },
-    #[error("{id:?} is no id of a thing; give one that the robot named, such as o00d1f3a5b7c9e0d2")]
-    NoId { id: String },
-    #[error(
-        "{url} answers, but not as slag-edge does: {cause}; see that --robot names a slag-edge of this version"
-    )]
-    Foreign { url: String, cause: serde_json::Error },
+    /// It was not asked, it refused, or what answered is no robot: why, and what to do.
+    #[error("{0}")]
+    Refused(String),
 }
 
 impl RobotError {
@@ -34,7 +24,7 @@ impl RobotError {
         if status == 405 || problem.as_ref().is_some_and(is_other) {
             detail += "; see that --robot names a slag-edge of this version, not a store";
         }
-        Self::Refused { status, detail }
+        Self::Refused(format!("the robot refused ({status}): {detail}"))
     }
 }
 

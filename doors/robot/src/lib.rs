@@ -1,12 +1,10 @@
 //! A client of the robot's HTTP interface: `slag-edge serve` under `/v1` (docs/api.md).
 
-mod args;
 mod client;
 mod error;
 mod reply;
 
-pub use args::RobotArgs;
-pub use client::{Robot, xyz};
+pub use client::{Robot, RobotArgs, xyz};
 pub use error::RobotError;
 pub use reply::{Answer, Nothing, PointAnswer, Reply, Results, Witness};
 pub use slag_api as api;

@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use serde::Deserialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use slag_api::Geographic;
 use slag_api::objects::OrientedBox;
 
@@ -30,10 +31,12 @@ pub struct Results<A = Answer> {
     pub answers: Vec<A>,
 }
 
-#[derive(Clone, Debug, Deserialize)]
+/// Why nothing was found.
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct Nothing {
-    /// `below-threshold`, `no-such-thing`, `no-such-pair` ...
+    /// "below-threshold", "no-such-thing", "no-such-pair", "too-few", "not-in-region", "not-looked-there" or others.
     pub kind: String,
+    /// The same in a sentence.
     pub detail: String,
 }
 
@@ -65,11 +68,15 @@ pub struct PointAnswer {
     pub score: f32,
 }
 
-#[derive(Clone, Debug, Deserialize)]
+/// The other thing of a relation.
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
+#[schemars(rename = "Related")]
 pub struct Witness {
-    /// The words that it answers.
+    /// Its words.
     pub thing: String,
-    /// Absent for the asker.
+    /// Its id; absent for the asker.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub id: Option<String>,
+    /// Its middle.
     pub position_in_world: [f64; 3],
 }

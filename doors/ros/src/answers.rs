@@ -167,10 +167,7 @@ pub fn clouds(header: &Header, points: &[PointAnswer]) -> Vec<PointCloud2> {
             is_dense: true,
         }
     };
-    match points.is_empty() {
-        true => vec![cloud(&[])],
-        false => points.chunks(POINTS_IN_CLOUD).map(cloud).collect(),
-    }
+    if points.is_empty() { vec![cloud(&[])] } else { points.chunks(POINTS_IN_CLOUD).map(cloud).collect() }
 }
 
 #[cfg(test)]

@@ -5,7 +5,6 @@ use serde::{Deserialize, Serialize};
 
 /// `geometry_msgs/Point`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[allow(missing_docs)]
 pub struct Point {
     pub x: f64,
     pub y: f64,
@@ -17,7 +16,6 @@ pub type Vector3 = Point;
 
 /// `geometry_msgs/Quaternion`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[allow(missing_docs)]
 pub struct Quaternion {
     pub x: f64,
     pub y: f64,
@@ -27,7 +25,6 @@ pub struct Quaternion {
 
 /// `geometry_msgs/Pose`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[allow(missing_docs)]
 pub struct Pose {
     pub position: Point,
     pub orientation: Quaternion,

@@ -11,7 +11,6 @@ macro_rules! messages {
         $(
             $(#[$doc])*
             #[derive(Clone, Debug, Serialize, Deserialize)]
-            #[allow(missing_docs)]
             pub struct $name { $(pub $member: $kind),* }
             impl Message for $name {}
         )*

@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-use crate::fetch::{FetchRequest, Position};
+use crate::fetch::{self, FetchRequest, Position};
 use crate::query::{Engine, LENGTHS, is_length};
 use crate::score::MAX_COORDINATE;
 use crate::store::EdgeCache;
@@ -17,8 +17,6 @@ use slag_common::ByteSize;
 use slag_common::shard::Profile;
 use slag_models::commands::{self as model_commands, MODELS_HELP, RunArgs};
 use slag_models::hub::cache_folder;
-use slag_models::session::SessionError;
-use slag_models::{ModelDir, SessionOptions};
 
 use super::failure::Failure;
 
@@ -77,22 +75,6 @@ impl DownloadArgs {
 }
 
 #[derive(Debug, Args)]
-pub struct ThreadArgs {
-    /// Threads for answering questions, at most 256 [default: the number of cores].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
-    pub threads: Option<u32>,
-}
-
-impl ThreadArgs {
-    /// Sets the number of threads for answering; once per process.
-    pub fn apply(&self) -> Result<(), Failure> {
-        let Some(n) = self.threads else { return Ok(()) };
-        let built = rayon::ThreadPoolBuilder::new().num_threads(n as usize).build_global();
-        built.map_err(|e| Failure::failed("threads", e))
-    }
-}
-
-#[derive(Debug, Args)]
 pub struct ModelArgs {
     #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR", help = MODELS_HELP)]
     pub models: Option<PathBuf>,
@@ -103,8 +85,9 @@ pub struct ModelArgs {
 /// What answers questions: the shards on board and a text model.
 #[derive(Debug, Args)]
 pub struct EngineArgs {
-    #[command(flatten)]
-    pub threads: ThreadArgs,
+    /// Threads for answering questions, at most 256 [default: the number of cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub threads: Option<u32>,
     #[command(flatten)]
     pub cache: CacheArgs,
     #[command(flatten)]
@@ -112,9 +95,16 @@ pub struct EngineArgs {
 }
 
 impl EngineArgs {
+    /// Sets the number of threads for answering; once per process.
+    pub fn set_threads(&self) -> Result<(), Failure> {
+        let Some(n) = self.threads else { return Ok(()) };
+        let built = rayon::ThreadPoolBuilder::new().num_threads(n as usize).build_global();
+        built.map_err(|e| Failure::failed("threads", e))
+    }
+
     /// Opens what is on board.
     pub fn open(self) -> Result<Engine, Failure> {
-        self.threads.apply()?;
+        self.set_threads()?;
         let engine = engine(self.cache.open()?, &self.models)?;
         engine.reload()?;
         Ok(engine)
@@ -123,25 +113,19 @@ impl EngineArgs {
 
 /// Makes an engine from a cache and a text model; without one given, scenes' own models are used.
 pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
-    let (given, options) = text_model(models)?;
-    let open = || TextService::open(&given, &options).map_err(|e| Failure::failed("models", e));
+    let failed = |e: anyhow::Error| Failure::failed("models", e);
+    let given = model_commands::open(models.models.as_deref(), &variable);
+    let exe = std::env::current_exe().unwrap_or_default();
+    let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let runtimes = model_commands::runtime_folders(&exe);
+    // One text at a time.
+    let options = models.how.session_options(&runtimes, n_cores.min(MAX_MODEL_THREADS));
+    let (options, given) = (options.map_err(|e| failed(e.into()))?, given.map_err(|e| failed(e.into()))?);
+    let open = || TextService::open(&given, &options).map_err(|e| failed(e.into()));
     match &models.models {
         Some(_) => Ok(Engine::new(cache, open()?)),
         None => Engine::with_carried(cache, options.clone(), open),
     }
-}
-
-pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
-    let models = model_commands::open(args.models.as_deref(), &variable);
-    let options = session_options(&args.how).map_err(|e| Failure::failed("models", e))?;
-    Ok((models.map_err(|e| Failure::failed("models", e))?, options))
-}
-
-/// Returns the options for one text at a time, with a few threads.
-pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
-    let exe = std::env::current_exe().unwrap_or_default();
-    let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
-    how.session_options(&model_commands::runtime_folders(&exe), n_cores.min(MAX_MODEL_THREADS))
 }
 
 /// Parses a value by its name in JSON.
@@ -151,6 +135,12 @@ pub(super) fn named<T: DeserializeOwned>(text: &str) -> Result<T, Error> {
 
 pub fn variable(name: &str) -> Option<OsString> {
     std::env::var_os(name)
+}
+
+/// Parses a store's address, so that a wrong one is refused before anything starts.
+pub(super) fn parse_store(text: &str) -> Result<String, String> {
+    let address = fetch::check_address(text).map(|()| text.to_owned());
+    address.map_err(|what| format!("{what}; give an address like http://host:port"))
 }
 
 pub(super) fn parse_radius(text: &str) -> Result<f64, String> {

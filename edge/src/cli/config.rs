@@ -51,8 +51,8 @@ pub fn parse(
     let Ok(first) = first else { return Ok(command.try_get_matches_from(line)?) };
     let named = first.try_get_one::<OsString>(FILE_FLAG).ok().flatten().map(PathBuf::from);
     let file = read(named, variable)?;
-    let settings =
-        Settings { variable, file, explicit: explicit(&first), asked: asked(&first), root: command.clone() };
+    let (asked, explicit) = asked(&first);
+    let settings = Settings { variable, file, explicit, asked, root: command.clone() };
     let command = settings.apply(command, &[])?;
     if let Some(file) = &settings.file {
         file.refuse_unknown(&command, &file.table, &mut Vec::new())?;
@@ -88,15 +88,6 @@ fn read(
     Ok(Some(File { path, table }))
 }
 
-fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
-    let is_given = |id: &&clap::Id| matches.value_source(id.as_str()) == Some(ValueSource::CommandLine);
-    let mut ids: BTreeSet<String> = matches.ids().filter(is_given).map(ToString::to_string).collect();
-    if let Some((_, below)) = matches.subcommand() {
-        ids.extend(explicit(below));
-    }
-    ids
-}
-
 /// Lets `--trust-first=false` switch off a flag that a file switches on.
 fn switch(arg: Arg) -> Arg {
     let arg = arg.action(ArgAction::Set).num_args(0..=1).require_equals(true);
@@ -111,46 +102,34 @@ fn switchable(command: Command) -> Command {
     command.mut_args(|arg| if is_switch(&arg) { switch(arg) } else { arg })
 }
 
-/// Returns the names of the requested command and its parents.
-fn asked(matches: &ArgMatches) -> Vec<String> {
-    let mut names = Vec::new();
-    let mut at = matches;
-    while let Some((name, below)) = at.subcommand() {
+/// Returns the names of the requested command and its parents, and the flags that the line gives.
+fn asked(matches: &ArgMatches) -> (Vec<String>, BTreeSet<String>) {
+    let (mut names, mut explicit, mut at) = (Vec::new(), BTreeSet::new(), matches);
+    loop {
+        let is_given = |id: &&clap::Id| at.value_source(id.as_str()) == Some(ValueSource::CommandLine);
+        explicit.extend(at.ids().filter(is_given).map(ToString::to_string));
+        let Some((name, below)) = at.subcommand() else { return (names, explicit) };
         names.push(name.to_owned());
         at = below;
     }
-    names
 }
 
 /// Returns a warning for each variable with our prefix and an unknown name.
 pub fn unknown_variables(root: &Command, names: impl Iterator<Item = String>) -> Vec<String> {
-    let known = known_variables(root);
+    let of_command = |(path, command): (Vec<&str>, &Command)| -> Vec<String> {
+        let longs = flags(command).filter_map(Arg::get_long);
+        longs.flat_map(|long| [variable_of([long]), variable_of([&path[..], &[long]].concat())]).collect()
+    };
+    let of_commands = with_those_below(root).into_iter().flat_map(of_command);
+    let known: BTreeSet<String> = of_commands.chain([variable_of([FILE_FLAG])]).collect();
     let warning = |name: String| {
         let likeness = |known: &&String| strsim::jaro(known, &name);
         let nearest = known.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
         let hint = nearest.map(|nearest| format!("; perhaps {nearest}")).unwrap_or_default();
         format!("{name} is set, but it is no variable of a flag{hint}")
     };
+    let is_ours = |name: &str| name.strip_prefix(PREFIX).is_some_and(|rest| rest.starts_with('_'));
     names.filter(|name| is_ours(name) && !known.contains(name)).map(warning).collect()
-}
-
-fn is_ours(name: &str) -> bool {
-    name.strip_prefix(PREFIX).is_some_and(|rest| rest.starts_with('_'))
-}
-
-fn known_variables(root: &Command) -> BTreeSet<String> {
-    let mut known = BTreeSet::from([variable_of([FILE_FLAG])]);
-    let mut waiting = vec![(root, Vec::new())];
-    while let Some((command, path)) = waiting.pop() {
-        for long in flags(command).filter_map(Arg::get_long) {
-            known.insert(variable_of([long]));
-            known.insert(variable_of(path.iter().copied().chain([long])));
-        }
-        for below in command.get_subcommands() {
-            waiting.push((below, path.iter().copied().chain([below.get_name()]).collect()));
-        }
-    }
-    known
 }
 
 /// Returns a flag's variable, by the names of its command's path and its own.
@@ -170,11 +149,13 @@ fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
     command.get_arguments().filter(is_named).filter(move |arg| !is_help(arg) && by_hand(arg))
 }
 
-fn with_those_below(command: &Command) -> Vec<&Command> {
-    let mut all = vec![command];
+/// Returns a command and all below it, each with the names on the way there.
+fn with_those_below(command: &Command) -> Vec<(Vec<&str>, &Command)> {
+    let mut all = vec![(Vec::new(), command)];
     let mut at = 0;
-    while let Some(command) = all.get(at) {
-        all.extend(command.get_subcommands());
+    while let Some((path, command)) = all.get(at).cloned() {
+        let below = command.get_subcommands();
+        all.extend(below.map(|below| ([&path[..], &[below.get_name()]].concat(), below)));
         at += 1;
     }
     all
@@ -260,8 +241,8 @@ impl Settings<'_> {
         command.get_arguments().any(|other| is_given(other) && exclude(command, arg, other))
     }
 
-    /// Refuses a flag without another one that it requires. A flag for all commands is skipped instead if another
-    /// command accepts it alone: `radius` is a fetch's before it is a question's.
+    /// Refuses a flag without another one that it requires. A value for all commands does not count there: `radius` is
+    /// a fetch's before it is a question's.
     fn with_what_it_needs(
         &self,
         command: &Command,
@@ -274,7 +255,7 @@ impl Settings<'_> {
             });
             let Some((at, lacks)) = lacking else { return Ok(given) };
             let of = given.remove(at);
-            if of.rank.is_own || !self.stands_alone(command, &of) {
+            if of.rank.is_own {
                 let what = format!("needs {} as well; give it, or take this away", lacks.join(" and "));
                 return Err(wrong(&of.place, &what));
             }
@@ -293,16 +274,6 @@ impl Settings<'_> {
             command.get_arguments().any(|arg| arg.get_long() == flag && flag.is_some() && is_given(arg))
         };
         needs(command, arg, &of.values).into_iter().filter(|usage| !is_there(usage)).collect()
-    }
-
-    /// Returns whether another command's flag of this name accepts the values, without requiring others.
-    fn stands_alone(&self, command: &Command, of: &Given) -> bool {
-        let long = argument(command, &of.id).and_then(Arg::get_long);
-        let fits = |arg: &Arg| checked(arg, of.values.clone(), &of.place).is_ok();
-        with_those_below(&self.root).into_iter().any(|command| {
-            let mut same = flags(command).filter(|other| other.get_long() == long);
-            same.any(|arg| fits(arg) && needs(command, arg, &of.values).is_empty())
-        })
     }
 
     /// Returns a flag's value: the environment's, else the file's; its own command's, else that for all.
@@ -339,7 +310,7 @@ impl Settings<'_> {
     ) -> Result<Option<Given>, ConfigError> {
         let check = |arg: &Arg| checked(arg, texts(arg).map_err(|what| wrong(&place, &what))?, &place);
         let fits_another = || {
-            let all = with_those_below(&self.root).into_iter().flat_map(flags);
+            let all = with_those_below(&self.root).into_iter().flat_map(|(_, command)| flags(command));
             all.filter(|other| other.get_long() == arg.get_long()).any(|other| check(other).is_ok())
         };
         match check(arg) {
@@ -365,8 +336,11 @@ impl File {
         table: &'a Table,
         path: &mut Vec<&'a str>,
     ) -> Result<(), ConfigError> {
-        let of = if path.is_empty() { with_those_below(command) } else { vec![command] };
-        let longs = of.into_iter().flat_map(flags).filter_map(Arg::get_long);
+        let mut of = with_those_below(command);
+        if !path.is_empty() {
+            of.truncate(1);
+        }
+        let longs = of.into_iter().flat_map(|(_, command)| flags(command)).filter_map(Arg::get_long);
         let known: BTreeSet<String> = longs.map(str::to_owned).collect();
         for (key, value) in table {
             if let (Some(below), Value::Table(table)) = (command.find_subcommand(key), value) {

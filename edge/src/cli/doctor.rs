@@ -71,10 +71,7 @@ pub fn run(args: DoctorArgs) -> Result<(), Failure> {
     let mut findings = vec![disk(&cache), trust(&cache)];
     findings.extend(on_board(&cache));
     findings.push(text_model(&cache, &args.models));
-    match args.json {
-        true => print_json(&findings)?,
-        false => print(&findings)?,
-    }
+    if args.json { print_json(&findings) } else { Ok(print(&findings)?) }?;
     match findings.iter().filter(|finding| finding.verdict == Verdict::Missing).count() {
         0 => Ok(()),
         n => Err(Failure::failed("doctor", anyhow!("this robot cannot answer yet: {n} missing"))),

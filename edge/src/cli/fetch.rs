@@ -11,12 +11,11 @@ use clap::Args;
 use glam::DVec3;
 use slag_service::stop::on_stop;
 
-use super::args::{CacheArgs, DownloadArgs};
+use super::args::{CacheArgs, DownloadArgs, parse_store};
 use super::failure::{Exit, Failure};
 use super::follow::{FollowArgs, watch};
-use super::network::{environment, parse_store};
 use super::output::print_json;
-use super::progress::{Bar, bad_cells, print_report};
+use super::progress::{Bar, bad_cells, environment, print_report};
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-edge fetch --from http://BASE:7733 --at 12.5,-3,0 --radius 50\n\

@@ -15,9 +15,8 @@ use clap::Args;
 
 use super::args::parse_reach;
 use super::failure::Failure;
-use super::network::{environment, random};
 use super::output::print_json;
-use super::progress::{Bar, print_line};
+use super::progress::{Bar, environment, print_line, random};
 
 /// Settings for following a robot.
 #[derive(Debug, Args)]

@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
+use crate::goal::{self, GoalRequest, GoalTarget, Robot, Stand};
 use crate::query::parse_point;
 use crate::score::Budget;
 use anyhow::anyhow;
@@ -61,21 +61,14 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let engine = args.engine.open()?;
     let on_board = engine.on_board()?;
     if let Some(path) = &args.map {
-        let map = goal::floor_map(&on_board.snapshot, &request, &Budget::default()).map_err(failure)?;
+        let map = goal::floor_map(&on_board.snapshot, &request, &Budget::default())?;
         durable::write_result(path, |file| map.write_pgm(file))?;
     }
-    let reply = goal::find(&on_board, &request, &Budget::default()).map_err(failure)?;
+    let reply = goal::find(&on_board, &request, &Budget::default())?;
     if args.json {
         return print_json(&reply);
     }
     Ok(std::io::stdout().write_all(lines(&reply).as_bytes())?)
-}
-
-fn failure(error: GoalError) -> Failure {
-    match error {
-        GoalError::Query(error) => error.into(),
-        other => Failure::failed(other.kind(), other),
-    }
 }
 
 fn lines(reply: &GoalReply) -> String {

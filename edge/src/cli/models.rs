@@ -27,8 +27,5 @@ pub fn run(args: ModelsArgs) -> Result<(), Failure> {
     };
     let report = model_commands::run(&args.command, &context);
     let report = report.map_err(|e| Failure::failed("models", e))?;
-    match args.json {
-        true => print_json(&report),
-        false => Ok(write!(io::stdout(), "{report}")?),
-    }
+    if args.json { print_json(&report) } else { Ok(write!(io::stdout(), "{report}")?) }
 }

@@ -1,13 +1,30 @@
-//! A progress line on the terminal, and reports of fetches.
+//! Fetching with the real clock and network: a progress line on the terminal, and reports.
 
+use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io::{self, Write};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use crate::fetch::{DownloadFailure, FetchReport, Progress, Tally};
+use crate::fetch::{DownloadFailure, Environment, FetchReport, NetworkLimits, Progress, Tally};
 use slag_common::ByteSize;
 
 use super::failure::Failure;
 use super::output::print_pairs;
+
+pub fn environment<'a>(
+    ca: Option<&'a Path>,
+    cancel: &'a AtomicBool,
+    progress: &'a dyn Progress,
+) -> Environment<'a> {
+    let (now_unix_secs, limits) = (crate::now_unix_secs(), NetworkLimits::default());
+    Environment { now_unix_secs, cancel, progress, random: &random, ca, limits }
+}
+
+/// Returns a number in 0..1 that differs between robots, so that a fleet does not retry in step.
+pub fn random() -> f64 {
+    // The standard library's random hash keys are new for each call.
+    (RandomState::new().build_hasher().finish() >> 11) as f64 / (1u64 << 53) as f64
+}
 
 pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     let tally = |t: &Tally| format!("{} shards, {}", t.n_shards, ByteSize(t.bytes));

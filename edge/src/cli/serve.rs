@@ -15,10 +15,9 @@ use slag_service::listen::{Listen, answers, bind};
 use slag_service::stop::stop_signal;
 use slag_service::tls::{Tls, TlsFiles};
 
-use super::args::{CacheArgs, DownloadArgs, EngineArgs, engine, parse_bytes};
+use super::args::{CacheArgs, DownloadArgs, EngineArgs, engine, parse_bytes, parse_store};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
-use super::network::parse_store;
 use crate::fetch::follow::Following;
 use crate::http::{self, App, Settings};
 use crate::query::Engine;
@@ -78,7 +77,7 @@ pub struct ServeArgs {
 }
 
 pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
-    args.engine.threads.apply()?;
+    args.engine.set_threads()?;
     let access = access(&mut args)?;
     let tls = tls(&mut args)?;
     let cache = std::mem::replace(&mut args.engine.cache, CacheArgs { cache: None }).open()?;

@@ -8,10 +8,10 @@ use clap::{ArgGroup, Args, Subcommand};
 use slag_common::files;
 use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
 
-use super::args::CacheArgs;
+use super::args::{CacheArgs, parse_store};
 use super::failure::Failure;
-use super::network::{environment, parse_store};
 use super::output::{print_json, print_pairs};
+use super::progress::environment;
 
 #[derive(Debug, Subcommand)]
 pub enum TrustCommand {

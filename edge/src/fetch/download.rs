@@ -61,11 +61,14 @@ pub fn check_address(from: &str) -> Result<(), &'static str> {
 
 impl<'a> Client<'a> {
     pub fn new(from: &str, environment: &'a Environment<'a>) -> Result<Self, FetchError> {
-        let bad = |what: &str| FetchError::Address { from: from.to_owned(), what: what.to_owned() };
-        check_address(from).map_err(bad)?;
+        check_address(from).map_err(|what| {
+            let advice = "give one like http://host:port";
+            FetchError::Request(format!("{from:?} is not the address of a store: {what}; {advice}"))
+        })?;
         let tls = download::tls(environment.ca).map_err(|what| {
-            let path = environment.ca.unwrap_or("".as_ref()).to_owned();
-            FetchError::Ca { path, what }
+            let (path, expected) =
+                (environment.ca.unwrap_or("".as_ref()), "certificates of authorities in PEM");
+            FetchError::Request(format!("{}: {what}, expected {expected}; check --ca", path.display()))
         })?;
         // Neither redirects nor a proxy from the environment: requests go to the given address only.
         let limits = environment.limits.clone();

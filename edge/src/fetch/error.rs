@@ -14,12 +14,9 @@ use crate::store::StoreError;
 
 #[derive(Debug, thiserror::Error)]
 pub enum FetchError {
-    #[error("no {what} is given, and no earlier fetch recorded one; {advice}")]
-    NotGiven { what: &'static str, advice: &'static str },
-    #[error("{from:?} is not the address of a store: {what}; give one like http://host:port")]
-    Address { from: String, what: String },
-    #[error("{}: {what}, expected certificates of authorities in PEM; check --ca", path.display())]
-    Ca { path: PathBuf, what: String },
+    /// What the request lacks or names wrongly, and what to do.
+    #[error("{0}")]
+    Request(String),
     #[error(transparent)]
     Records(#[from] RecordsError),
     #[error(transparent)]
@@ -48,12 +45,6 @@ pub enum FetchError {
         held: String,
         offered: String,
     },
-    #[error("{from} has no root with SHA-256 {sha256}; check the hash and the address")]
-    NoSuchRoot { from: String, sha256: String },
-    #[error(
-        "the store offers scene {offered:?}, this robot expects {expected:?}; check the address, or change the robot's scene once with `slag-edge fetch --scene {offered:?}`"
-    )]
-    Scene { expected: String, offered: String },
     #[error(
         "shard {hash} matches its hash but is not a valid shard of this scene; have the scene published again"
     )]

@@ -12,7 +12,7 @@ use super::plan::{Plan, Wanted};
 use super::staging::put;
 use crate::store::history::{self, MAX_GENERATIONS, Record};
 use crate::store::{
-    self, BadCell, CellFault, Current, CurrentCell, EdgeCache, OldShard, OpenShard, beside_queries,
+    self, BadCell, CellFault, Current, CurrentCell, EdgeCache, Listed, OldShard, OpenShard, beside_queries,
 };
 
 #[derive(Clone, Copy)]
@@ -62,10 +62,8 @@ impl Before<'_> {
 
     fn is_fit(&self, old: &OldShard, new: &Manifest, wanted: &Wanted, cell_id: u32) -> bool {
         let Ok(manifest) = self.cache.read_manifest(old.manifest_hash) else { return false };
-        let path = self.cache.shard_path(old.hash);
-        let cell = CurrentCell { cell_id, hash: old.hash, len_bytes: old.len_bytes };
-        store::can_stand_in(&manifest, new, cell_id)
-            && store::check_file(self.cache, &path, &cell, wanted.profile, &manifest).is_ok()
+        let listed = Listed { manifest: &manifest, profile: wanted.profile, at: &old.of_cell(cell_id) };
+        store::can_stand_in(&manifest, new, cell_id) && listed.check_file(self.cache).is_ok()
     }
 }
 
@@ -80,7 +78,7 @@ pub fn remember(cache: &EdgeCache, old: &Current, manifest: &Manifest, next: Has
     if leaving.is_empty() {
         return;
     }
-    let open = |cell: &CurrentCell| OpenShard::open(cache, manifest, old.profile, cell).ok();
+    let open = |at: &CurrentCell| Listed { manifest, profile: old.profile, at }.open(cache).ok();
     let shards: Vec<OpenShard> = beside_queries(|| leaving.par_iter().filter_map(open).collect());
     let Some(record) = Record::collect(manifest, old.centre_in_world, &shards) else { return };
     drop(shards);

@@ -16,7 +16,7 @@ use super::error::FetchError;
 use super::offer::Offer;
 use super::staging::part_path;
 use crate::store::files::is_bad_medium;
-use crate::store::{self, CellFault, CurrentCell, EdgeCache, StoreError};
+use crate::store::{self, CellFault, CurrentCell, EdgeCache, Listed, StoreError};
 
 const MAX_PARALLEL: usize = 64;
 
@@ -43,6 +43,10 @@ impl<'a> Check<'a> {
         self.cells.get(&hash).copied()
     }
 
+    fn listed(&self, at: &'a CurrentCell) -> Listed<'a> {
+        Listed { manifest: self.manifest, profile: self.profile, at }
+    }
+
     /// Returns whether an object on board is what the manifest describes. It is read only if its own manifest
     /// described it otherwise: readers find and mark rot.
     pub(crate) fn is_fit(&self, cache: &EdgeCache, on_board: Option<&Offer>, hash: Hash32) -> bool {
@@ -53,18 +57,15 @@ impl<'a> Check<'a> {
             Some((shard.hash, listed.n_gaussians, manifest.encoder.dim, manifest.encoder.id))
         };
         on_board.is_some_and(|before| described(&before.manifest) == described(self.manifest))
-            || store::check_file(cache, &cache.shard_path(hash), cell, self.profile, self.manifest).is_ok()
+            || self.listed(cell).check_file(cache).is_ok()
     }
 
     /// Checks that bytes are the manifest's shard or text-model file.
     pub fn object(&self, path: &Path, hash: Hash32, bytes: &[u8]) -> Result<(), StoreError> {
         if let Some(cell) = self.cell(hash) {
-            return store::check_shard(path, bytes, cell, self.profile, self.manifest).map(drop);
+            return self.listed(cell).check(path, bytes).map(drop);
         }
-        match Hash32::of(bytes) {
-            found if found == hash => Ok(()),
-            found => Err(StoreError::Hash { path: path.to_owned(), expected: hash, found }),
-        }
+        StoreError::check_hash(path, hash, bytes)
     }
 }
 

@@ -71,9 +71,9 @@ impl Offer {
     pub fn check(&self, scene: Option<&str>) -> Result<(), FetchError> {
         let offered = &self.manifest.scene;
         match scene.filter(|expected| expected != offered) {
-            Some(expected) => {
-                Err(FetchError::Scene { expected: expected.to_owned(), offered: offered.clone() })
-            }
+            Some(expected) => Err(FetchError::Request(format!(
+                "the store offers scene {offered:?}, this robot expects {expected:?}; check the address, or change the robot's scene once with `slag-edge fetch --scene {offered:?}`"
+            ))),
             None => Ok(()),
         }
     }

@@ -46,19 +46,16 @@ impl Plan {
     ) -> Result<Self, PlanError> {
         let Wanted { profile, centre_in_world, radius, max_bytes } = *wanted;
         if !(radius >= 0.0 && radius.is_finite()) {
-            let (name, expected) = ("radius", "zero or more, and finite");
-            return Err(PlanError::Number { name, value: radius, expected });
+            return Err(PlanError::number("radius", radius, "zero or more, and finite"));
         }
         let positions = CellIndex::new(&manifest.cells).within(centre_in_world, radius);
         if positions.is_empty() {
             let distances = manifest.cells.iter().map(|cell| cell.bounds.distance_to(centre_in_world));
             let nearest = distances.fold(f64::INFINITY, f64::min);
-            return Err(PlanError::NoCells {
-                scene: manifest.scene.clone(),
-                centre_in_world,
-                radius,
-                nearest,
-            });
+            return Err(PlanError(format!(
+                "scene {:?} has no cell within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or increase the radius",
+                manifest.scene
+            )));
         }
         let cells = cells_at(manifest, profile, &positions)?;
         let needs = objects(&cells, manifest)?;
@@ -66,8 +63,10 @@ impl Plan {
         let needed_bytes = needs.iter().fold(0u64, |sum, object| sum.saturating_add(object.len_bytes));
         let budget_bytes = max_bytes.unwrap_or(needed_bytes.saturating_mul(2));
         if needed_bytes > budget_bytes {
-            let n_cells = cells.len();
-            return Err(PlanError::TooLarge { n_cells, needed_bytes, max_bytes: budget_bytes });
+            return Err(PlanError(format!(
+                "the {} cells need {needed_bytes} bytes, the limit is {budget_bytes}; choose a smaller radius or profile, or raise the limit",
+                cells.len()
+            )));
         }
         let mut plan = Self { cells, ..Self::default() };
         for object in needs {
@@ -109,7 +108,10 @@ fn cells_at(
             }
             None => {
                 let names: Vec<&str> = cell.shards.keys().map(|profile| profile.name()).collect();
-                Err(PlanError::NoProfile { cell_id: cell.cell_id, profile, available: names.join(", ") })
+                let (cell_id, available) = (cell.cell_id, names.join(", "));
+                Err(PlanError(format!(
+                    "cell {cell_id} has no {profile} shard; it has: {available}; fetch one of those profiles"
+                )))
             }
         }
     });
@@ -121,7 +123,10 @@ fn objects(cells: &[CurrentCell], manifest: &Manifest) -> Result<Vec<ObjectRecor
     let mut seen = BTreeSet::new();
     let object = |cell: &CurrentCell| match seen.insert(cell.hash) {
         true => Ok(ObjectRecord { hash: cell.hash, len_bytes: cell.len_bytes }),
-        false => Err(PlanError::Conflict { cell_id: cell.cell_id, hash: cell.hash }),
+        false => Err(PlanError(format!(
+            "the manifest lists shard {} for cell {} and for another cell; have the scene published again",
+            cell.hash, cell.cell_id
+        ))),
     };
     let mut objects: Vec<ObjectRecord> = cells.iter().map(object).collect::<Result<_, _>>()?;
     let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
@@ -185,11 +190,11 @@ mod tests {
             let needed_bytes: u64 = near.iter().map(|i| boxes[*i as usize].2).sum();
             let budget_bytes = max_bytes.unwrap_or(2 * needed_bytes);
             if near.is_empty() {
-                prop_assert!(matches!(plan, Err(PlanError::NoCells { .. })), "{:?}", plan);
+                prop_assert!(plan.is_err_and(|e| e.to_string().contains("has no cell within")));
                 return Ok(());
             }
             if needed_bytes > budget_bytes {
-                prop_assert!(matches!(plan, Err(PlanError::TooLarge { .. })), "{:?}", plan);
+                prop_assert!(plan.is_err_and(|e| e.to_string().contains("bytes, the limit is")));
                 return Ok(());
             }
             let plan = plan.expect("possible");
@@ -245,15 +250,14 @@ mod tests {
         let at_zero =
             |radius, max_bytes| Plan::new(&good, &wanted(DVec3::ZERO, radius, max_bytes), &BTreeMap::new());
         for radius in [-1.0, f64::NAN, f64::INFINITY] {
-            assert!(
-                matches!(at_zero(radius, None), Err(PlanError::Number { name: "radius", .. })),
-                "{radius}"
-            );
+            let error = at_zero(radius, None).expect_err("no radius").to_string();
+            assert!(error.starts_with("radius is "), "{error}");
         }
         assert!(at_zero(0.5, Some(5)).is_ok());
         // 5 + u64::MAX does not wrap around.
         let error = at_zero(9.0, Some(1000)).expect_err("too large");
-        assert_eq!(error, PlanError::TooLarge { n_cells: 2, needed_bytes: u64::MAX, max_bytes: 1000 });
+        let expected = format!("the 2 cells need {} bytes, the limit is 1000;", u64::MAX);
+        assert!(error.to_string().starts_with(&expected), "{error}");
         let exact = Wanted { profile: Profile::Exact, ..wanted(DVec3::ZERO, 1.0, None) };
         let error = Plan::new(&good, &exact, &BTreeMap::new()).expect_err("no exact shards");
         assert!(error.to_string().contains("it has: compact"), "{error}");
@@ -261,7 +265,7 @@ mod tests {
         twice.cells[1].shards = twice.cells[0].shards.clone();
         let error =
             Plan::new(&twice, &wanted(DVec3::ZERO, 9.0, None), &BTreeMap::new()).expect_err("conflict");
-        assert_eq!(error, PlanError::Conflict { cell_id: 3, hash: hash(0) });
+        assert!(error.to_string().contains(&format!("{} for cell 3 and", hash(0))), "{error}");
 
         let at = |latitude_deg, longitude_deg| Position::Geographic {
             latitude_deg,
@@ -269,9 +273,11 @@ mod tests {
             height_m: None,
         };
         for place in [at(90.1, 0.0), at(f64::NAN, 0.0), at(0.0, -180.5), Position::World(DVec3::NAN)] {
-            assert!(matches!(place.in_world(&good), Err(PlanError::Number { .. })), "{place:?}");
+            let error = place.in_world(&good).expect_err("no place").to_string();
+            assert!(error.contains(", expected within "), "{place:?}: {error}");
         }
         let nowhere = Manifest { geo_reference: None, ..good };
-        assert!(matches!(at(46.8, -91.9).in_world(&nowhere), Err(PlanError::NoGeoReference { .. })));
+        let error = at(46.8, -91.9).in_world(&nowhere).expect_err("nowhere").to_string();
+        assert!(error.contains("has no geo-reference"), "{error}");
     }
 }

@@ -5,10 +5,8 @@ use std::str::FromStr;
 use glam::{DVec2, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use slag_common::Hash32;
 use slag_common::frames::{Aabb, Geographic};
 use slag_common::manifest::Manifest;
-use slag_common::shard::Profile;
 
 use crate::score::MAX_COORDINATE;
 
@@ -116,9 +114,11 @@ impl Position {
         match self {
             Self::World(position) => Ok(position),
             Self::Geographic { latitude_deg, longitude_deg, height_m } => {
-                let geo = manifest
-                    .geo_reference
-                    .ok_or_else(|| PlanError::NoGeoReference { scene: manifest.scene.clone() })?;
+                let Some(geo) = manifest.geo_reference else {
+                    let (scene, advice) = (&manifest.scene, "--at X,Y,Z, or `x y z` on a line");
+                    let what = format!("scene {scene:?} has no geo-reference");
+                    return Err(PlanError(format!("{what}; give the position in its world frame: {advice}")));
+                };
                 let at = |height_m| {
                     geo.world_from_geographic(Geographic { latitude_deg, longitude_deg, height_m })
                 };
@@ -143,7 +143,7 @@ impl Position {
         };
         let is_out = |value: f64, limit: f64| value.is_nan() || value.abs() > limit;
         match numbers.into_iter().find(|(_, value, limit, _)| is_out(*value, *limit)) {
-            Some((name, value, _, expected)) => Err(PlanError::Number { name, value, expected }),
+            Some((name, value, _, expected)) => Err(PlanError::number(name, value, expected)),
             None => Ok(()),
         }
     }
@@ -163,34 +163,15 @@ fn scene_height(manifest: &Manifest, point: DVec3) -> f64 {
     nearest.map_or(point.z, |bounds| bounds.centre().z)
 }
 
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum PlanError {
-    #[error("{name} is {value}, expected {expected}")]
-    Number { name: &'static str, value: f64, expected: &'static str },
-    #[error(
-        "scene {scene:?} has no geo-reference; give the position in its world frame: --at X,Y,Z, or `x y z` on a line"
-    )]
-    NoGeoReference { scene: String },
-    #[error(
-        "scene {scene:?} has no cell within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or increase the radius"
-    )]
-    NoCells {
-        scene: String,
-        centre_in_world: DVec3,
-        radius: f64,
-        /// Distance of the nearest cell; infinite in a scene without cells.
-        nearest: f64,
-    },
-    #[error("cell {cell_id} has no {profile} shard; it has: {available}; fetch one of those profiles")]
-    NoProfile { cell_id: u32, profile: Profile, available: String },
-    #[error(
-        "the {n_cells} cells need {needed_bytes} bytes, the limit is {max_bytes}; choose a smaller radius or profile, or raise the limit"
-    )]
-    TooLarge { n_cells: usize, needed_bytes: u64, max_bytes: u64 },
-    #[error(
-        "the manifest lists shard {hash} for cell {cell_id} and for another cell; have the scene published again"
-    )]
-    Conflict { cell_id: u32, hash: Hash32 },
+/// Why a request cannot be met: what was found, what was expected, and what to do.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct PlanError(pub(super) String);
+
+impl PlanError {
+    pub(super) fn number(name: &str, value: f64, expected: &str) -> Self {
+        Self(format!("{name} is {value}, expected {expected}"))
+    }
 }
 
 #[cfg(test)]

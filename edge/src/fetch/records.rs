@@ -70,14 +70,14 @@ pub struct Records {
     version: Option<Version>,
     pub(super) record: Record,
     damage: Option<String>,
-    _lock: Lock,
+    _lock: File,
 }
 
 impl Records {
     /// Opens the records and repairs a damaged copy; holds the lock until dropped.
     pub fn open(cache: &EdgeCache) -> Result<Self, RecordsError> {
         let busy = || RecordsError::Busy { path: cache.dir().to_owned() };
-        let lock = Lock::take(cache.dir())?.ok_or_else(busy)?;
+        let lock = lock(cache.dir())?.ok_or_else(busy)?;
         let copies = copies_of(cache);
         cache.create_dir(&copies.dir)?;
         let (found, damage) = match read(cache, &copies)? {
@@ -177,27 +177,21 @@ fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Result<Option<(Version
     Ok(copies.read(cache.files())?.and_then(|found| found.map(parse).transpose()))
 }
 
-/// The cache's lock, held until dropped.
-#[derive(Debug)]
-struct Lock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
-
-impl Lock {
-    fn take(dir: &Path) -> io::Result<Option<Self>> {
-        let path = dir.join("lock");
-        fs_err::create_dir_all(dir)?;
-        // Also opened to read: opening a pipe only to write would wait for a reader.
-        let file =
-            fs_err::OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path)?;
-        let file = file.into_parts().0;
-        let start = Instant::now();
-        loop {
-            match file.try_lock() {
-                Ok(()) => return Ok(Some(Self(file))),
-                Err(TryLockError::WouldBlock) if start.elapsed() > LOCK_TIMEOUT => return Ok(None),
-                Err(TryLockError::WouldBlock) => std::thread::sleep(LOCK_PAUSE),
-                Err(TryLockError::Error(e)) => {
-                    return Err(io::Error::new(e.kind(), format!("locking {}: {e}", path.display())));
-                }
+/// Takes the cache's lock, which lasts as long as the file is open; `None`: another fetch has it.
+fn lock(dir: &Path) -> io::Result<Option<File>> {
+    let path = dir.join("lock");
+    fs_err::create_dir_all(dir)?;
+    // Also opened to read: opening a pipe only to write would wait for a reader.
+    let file = fs_err::OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path)?;
+    let file = file.into_parts().0;
+    let start = Instant::now();
+    loop {
+        match file.try_lock() {
+            Ok(()) => return Ok(Some(file)),
+            Err(TryLockError::WouldBlock) if start.elapsed() > LOCK_TIMEOUT => return Ok(None),
+            Err(TryLockError::WouldBlock) => std::thread::sleep(LOCK_PAUSE),
+            Err(TryLockError::Error(e)) => {
+                return Err(io::Error::new(e.kind(), format!("locking {}: {e}", path.display())));
             }
         }
     }

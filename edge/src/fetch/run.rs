@@ -18,7 +18,7 @@ use super::records::{LastFetch, Records, RecordsError};
 use super::request::{Environment, FetchReport, FetchRequest, Tally, TextModelTally};
 use super::staging::{Usage, clear_manifests, clear_staging, part_path, put, remove, staging};
 use super::trust::trust_first;
-use crate::store::{Current, EdgeCache, StoreError, damaged};
+use crate::store::{Current, EdgeCache, StoreError};
 
 /// Most bytes of a cell in `current`.
 const CELL_BYTES: u64 = 512;
@@ -84,7 +84,8 @@ impl<'a> Fetch<'a> {
                     None => ("store address", "give one with --from URL"),
                     Some(_) => ("position", "give one with --at X,Y,Z or --at-geo LAT,LON"),
                 };
-                return Err(FetchError::NotGiven { what, advice });
+                let what = format!("no {what} is given, and no earlier fetch recorded one; {advice}");
+                return Err(FetchError::Request(what));
             }
         };
         let current = match cache.current() {
@@ -133,7 +134,7 @@ impl<'a> Fetch<'a> {
         let wanted = Wanted { profile, centre_in_world: last.at.in_world(manifest)?, radius, max_bytes };
         let mut held = usage.held_shards(cache)?;
         let mut plan = Plan::new(manifest, &wanted, &held)?;
-        let marked = damaged::marked(cache);
+        let marked = cache.marked_as_damaged();
         let check = Check::new(manifest, profile, &plan.cells);
         let is_unfit =
             |hash: &Hash32| marked.contains(hash) || !check.is_fit(cache, on_board.as_ref(), *hash);
@@ -173,7 +174,7 @@ impl<'a> Fetch<'a> {
         let check = Check::new(&offer.manifest, wanted.profile, &plan.cells);
         let parallel = self.request.parallel;
         let mut downloaded = download_all(cache, &self.client, &check, &plan.download, parallel)?;
-        damaged::unmark(cache, marked.intersection(&downloaded.good))?;
+        cache.unmark(marked.intersection(&downloaded.good))?;
         // Without its text model the new scene would not answer; the one on board does.
         let of_text_model = downloaded.bad.keys().find(|hash| check.is_of_text_model(**hash)).copied();
         if let Some((_, error)) = of_text_model.and_then(|hash| downloaded.bad.remove(&hash)) {
@@ -213,7 +214,7 @@ impl<'a> Fetch<'a> {
         clear_manifests(cache, &old_manifests.chain([offer.manifest_hash]).collect())?;
         clear_staging(cache, &[])?;
         let on_board = &in_use | &plan.spare;
-        damaged::unmark(cache, marked.difference(&on_board))?;
+        cache.unmark(marked.difference(&on_board))?;
         std::mem::take(&mut self.usage).finish(cache, &in_use, &on_board);
         Ok(())
     }

@@ -85,5 +85,8 @@ fn find_root(client: &Client<'_>, sha256: &str) -> Result<Vec<u8>, FetchError> {
             return Ok(bytes);
         }
     }
-    Err(FetchError::NoSuchRoot { from: client.base.clone(), sha256 })
+    let from = &client.base;
+    Err(FetchError::Request(format!(
+        "{from} has no root with SHA-256 {sha256}; check the hash and the address"
+    )))
 }

@@ -5,9 +5,9 @@ use slag_api::goal::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use slag_common::objects::{parse_public_id, public_id};
 
 use super::choose::choose;
-use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
-use super::surroundings::{START_M, Surroundings};
-use crate::query::{ClusterAnswer, Found, OnBoard, QueryRequest, Scene, coverage};
+use super::request::{GoalRequest, GoalTarget, Robot, Stand};
+use super::surroundings::{START_M, Surroundings, no_places};
+use crate::query::{ClusterAnswer, Found, OnBoard, QueryError, QueryRequest, Scene};
 use crate::score::{Budget, Region};
 
 const MAX_THINGS: usize = 5;
@@ -16,8 +16,8 @@ const MAX_POINTS: usize = 4096;
 /// Finds places to stand near a thing. Blocks for tens of milliseconds.
 ///
 /// # Errors
-/// [`GoalError`]. That there is no such place is a reply.
-pub fn find(on_board: &OnBoard, request: &GoalRequest, budget: &Budget) -> Result<GoalReply, GoalError> {
+/// [`QueryError`]. That there is no such place is a reply.
+pub fn find(on_board: &OnBoard, request: &GoalRequest, budget: &Budget) -> Result<GoalReply, QueryError> {
     request.check()?;
     let snapshot = &on_board.snapshot;
     let manifest = &snapshot.manifest;
@@ -102,17 +102,18 @@ fn things(
     request: &GoalRequest,
     near: DVec3,
     budget: &Budget,
-) -> Result<Result<Things, String>, GoalError> {
+) -> Result<Result<Things, String>, QueryError> {
     let text = match &request.target {
         GoalTarget::Object(id) => {
             if on_board.snapshot.objects.is_empty() {
-                return Err(GoalError::NoObjects);
+                let detail = "the scene has no objects to go to; encode it without --no-objects, publish it, and fetch it again";
+                return Err(no_places("no-objects", detail));
             }
             let scene = Scene::of(&on_board.snapshot);
             let found = scene.object(*id, None, budget);
             budget.check()?;
             let Some(object) = found else {
-                let missing = coverage(&scene, &Region::default()).missing();
+                let missing = scene.coverage(&Region::default()).missing();
                 let missing = missing.map(|missing| format!("; {missing}")).unwrap_or_default();
                 let (generation, id) = (scene.manifest.generation, public_id(*id));
                 return Ok(Err(format!("generation {generation} has no object {id} on board{missing}")));

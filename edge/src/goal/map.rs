@@ -6,8 +6,9 @@ use glam::DVec3;
 use slag_api::floor::Place;
 
 use super::ground::Floor;
-use super::request::{GoalError, GoalRequest};
+use super::request::GoalRequest;
 use super::surroundings::Surroundings;
+use crate::query::QueryError;
 use crate::score::Budget;
 use crate::store::Snapshot;
 
@@ -22,7 +23,11 @@ pub struct FloorMap {
 }
 
 /// Maps the ground around a robot; the request's thing is ignored.
-pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) -> Result<FloorMap, GoalError> {
+pub fn floor_map(
+    snapshot: &Snapshot,
+    request: &GoalRequest,
+    budget: &Budget,
+) -> Result<FloorMap, QueryError> {
     request.check()?;
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
     let seen = Surroundings::look(snapshot, request, near, budget)?;

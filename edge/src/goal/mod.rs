@@ -25,4 +25,4 @@ mod tests;
 
 pub use find::find;
 pub use map::{FloorMap, floor_map};
-pub use request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
+pub use request::{GoalRequest, GoalTarget, Robot, Stand};

@@ -5,8 +5,7 @@ use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use crate::query::{QueryError, RequestError};
-use crate::score::OverBudget;
+use crate::query::RequestError;
 
 pub const RADIUS_M: [f64; 2] = [0.05, 2.0];
 pub const REACH_M: [f64; 2] = [0.0, 10.0];
@@ -153,43 +152,6 @@ impl GoalRequest {
                 Err(RequestError::new("near", &near.to_string(), "a position within a million kilometres"))
             }
             _ => Ok(()),
-        }
-    }
-}
-
-#[derive(Debug, thiserror::Error)]
-pub enum GoalError {
-    #[error(transparent)]
-    Query(#[from] QueryError),
-    #[error(
-        "the scene does not say which places are free; encode it with --occupancy, publish it, and fetch it again"
-    )]
-    NoOccupancy,
-    #[error(
-        "the scene has no objects to go to; encode it without --no-objects, publish it, and fetch it again"
-    )]
-    NoObjects,
-}
-
-impl From<RequestError> for GoalError {
-    fn from(error: RequestError) -> Self {
-        Self::Query(error.into())
-    }
-}
-
-impl From<OverBudget> for GoalError {
-    fn from(error: OverBudget) -> Self {
-        Self::Query(error.into())
-    }
-}
-
-impl GoalError {
-    /// Returns the stable name of the error's kind, for programs.
-    pub fn kind(&self) -> &'static str {
-        match self {
-            Self::Query(error) => error.kind(),
-            Self::NoOccupancy => "no-occupancy",
-            Self::NoObjects => "no-objects",
         }
     }
 }

@@ -1,7 +1,9 @@
 //! The free and occupied places around a robot: the blocks of all shards, in columns.
 
+use std::ops::Range;
+
 use glam::DVec3;
-use slag_common::occupancy::{BLOCK_EDGE, Occupancy};
+use slag_common::occupancy::{BLOCK_EDGE, BlockRun, Occupancy};
 
 use crate::score::Budget;
 
@@ -93,9 +95,9 @@ impl Space {
         let mut starts = vec![0u32; n_columns + 1];
         let mut n_blocks = 0;
         for occupancy in of_lattice() {
-            for_columns(occupancy, &window, |column, _, masks| {
-                starts[column + 1] += masks.len() as u32;
-                n_blocks += masks.len();
+            for_columns(occupancy, &window, |column, _, _, blocks| {
+                starts[column + 1] += blocks.len() as u32;
+                n_blocks += blocks.len();
                 n_blocks <= MAX_BLOCKS
             });
         }
@@ -106,9 +108,10 @@ impl Space {
         let mut next = starts.clone();
         let mut blocks = bytemuck::zeroed_vec::<Stacked>(n_blocks);
         for occupancy in of_lattice() {
-            for_columns(occupancy, &window, |column, z, masks| {
+            for_columns(occupancy, &window, |column, z, run, of_run| {
                 let next = &mut next[column];
-                for (z, [occupied, free]) in (z..).zip(masks) {
+                for (z, block) in (z..).zip(of_run) {
+                    let [occupied, free] = run.masks_of(block);
                     blocks[*next as usize] = Stacked { z, occupied, free };
                     *next += 1;
                 }
@@ -142,32 +145,12 @@ impl Space {
     }
 }
 
-/// The masks of a run's blocks in a column.
-struct Masks<'a> {
-    run: slag_common::occupancy::BlockRun<'a>,
-    blocks: std::ops::Range<u32>,
-}
-
-impl Iterator for Masks<'_> {
-    type Item = [u64; 2];
-
-    fn next(&mut self) -> Option<[u64; 2]> {
-        self.blocks.next().map(|block| self.run.masks_of(block))
-    }
-
-    fn size_hint(&self) -> (usize, Option<usize>) {
-        (self.blocks.len(), Some(self.blocks.len()))
-    }
-}
-
-impl ExactSizeIterator for Masks<'_> {}
-
-/// Visits the pieces of an occupancy's runs within a window's columns: column, height of the first block,
-/// masks. Ends when `visit` returns false. Time is bounded by the window and the number of runs.
+/// Visits the pieces of an occupancy's runs within a window's columns: column, height of the first block, run and
+/// blocks. Ends when `visit` returns false. Time is bounded by the window and the number of runs.
 fn for_columns<'a>(
     occupancy: &Occupancy<'a>,
     window: &Window,
-    mut visit: impl FnMut(usize, u8, Masks<'a>) -> bool,
+    mut visit: impl FnMut(usize, u8, &BlockRun<'a>, Range<u32>) -> bool,
 ) {
     let (first, [_, n_y, n_z]) = (occupancy.header.first_block, occupancy.header.n_blocks);
     // Offsets of the window in the shard's box, clipped to it.
@@ -203,7 +186,7 @@ fn for_columns<'a>(
                 let offset = |axis: usize, of: u32| (first[axis] + of as i32 - window.first[axis]) as usize;
                 let z = offset(2, blocks.start - bottom) as u8;
                 let place = offset(0, x) * window.n[1] + offset(1, y);
-                if !visit(place, z, Masks { run: run.clone(), blocks }) {
+                if !visit(place, z, &run, blocks) {
                     return;
                 }
             }

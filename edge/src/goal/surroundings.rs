@@ -6,9 +6,9 @@ use slag_common::occupancy::Occupancy;
 use super::clearance::{self, Clearance};
 use super::ground::{Floor, Ground, SURFACE_DEPTH};
 use super::paths::Paths;
-use super::request::{GoalError, GoalRequest, LEAST_STEP_VOXELS};
+use super::request::{GoalRequest, LEAST_STEP_VOXELS};
 use super::space::{Space, Window};
-use crate::query::RequestError;
+use crate::query::{QueryError, RequestError};
 use crate::score::Budget;
 use crate::store::Snapshot;
 
@@ -21,6 +21,10 @@ const MAX_CELLS: f64 = 4.2e6;
 const MAX_HEIGHT_M: f64 = 1.5;
 /// Bytes per cell, over all steps.
 const CELL_BYTES: usize = 36;
+
+pub(super) fn no_places(kind: &'static str, detail: &str) -> QueryError {
+    QueryError::Unable { kind, title: "No places known", detail: detail.to_owned() }
+}
 
 /// The ground and the obstacles.
 pub(super) struct Surroundings<'a> {
@@ -68,14 +72,14 @@ impl<'a> Surroundings<'a> {
     /// Examines the places around a robot, which is at the request's `near`, or else at `centre`.
     ///
     /// # Errors
-    /// [`GoalError::NoOccupancy`]; a range with too many places; a step that the voxels do not tell from none;
+    /// No occupancy; a range with too many places; a step that the voxels do not tell from none;
     /// the budget.
     pub(super) fn look(
         snapshot: &Snapshot,
         request: &GoalRequest,
         centre: DVec3,
         budget: &'a Budget,
-    ) -> Result<Self, GoalError> {
+    ) -> Result<Self, QueryError> {
         let occupancies: Vec<Occupancy<'_>> =
             snapshot.shards.iter().filter_map(|shard| shard.additions().occupancy).collect();
         Self::of(&occupancies, request, centre, budget)
@@ -87,8 +91,12 @@ impl<'a> Surroundings<'a> {
         request: &GoalRequest,
         centre: DVec3,
         budget: &'a Budget,
-    ) -> Result<Self, GoalError> {
-        let voxel = occupancies.first().ok_or(GoalError::NoOccupancy)?.header.voxel;
+    ) -> Result<Self, QueryError> {
+        let Some(first) = occupancies.first() else {
+            let detail = "the scene does not say which places are free; encode it with --occupancy, publish it, and fetch it again";
+            return Err(no_places("no-occupancy", detail));
+        };
+        let voxel = first.header.voxel;
         let near = request.near.unwrap_or(centre);
         let most_m = MAX_CELLS.sqrt() / 2.0 * voxel;
         let too_far = |most: String| RequestError::new("range_m", &request.robot.range_m.to_string(), most);

@@ -4,7 +4,6 @@ mod app;
 mod ask;
 mod follower;
 mod forms;
-mod named;
 mod position;
 mod problem;
 mod query;

@@ -10,8 +10,8 @@ use slag_models::InferenceError;
 use slag_service::params::ParameterMembers;
 use slag_service::problem::Problem;
 
-use crate::query::{QueryError, RequestError};
-use crate::score::{OverBudget, ScoreError};
+use crate::query::{NO_SUCH_GENERATION, QueryError, RequestError};
+use crate::score::OverBudget;
 use crate::text::TextError;
 
 /// `Retry-After` of requests beyond a limit.
@@ -106,43 +106,32 @@ impl From<OverBudget> for Problem {
 impl From<QueryError> for Problem {
     fn from(error: QueryError) -> Self {
         let (kind, detail) = (error.kind(), error.to_string());
-        let unavailable = |title| {
-            Problem::new(StatusCode::SERVICE_UNAVAILABLE, kind, title, detail.clone()).retry_after(RETRY_SECS)
-        };
+        let refused = |status, title| Self::new(status, kind, title, detail.clone());
+        let unavailable = |title| refused(StatusCode::SERVICE_UNAVAILABLE, title).retry_after(RETRY_SECS);
         let parameter = if matches!(error, QueryError::Negatives(_)) { "negatives" } else { "text" };
         let unknown_words = |found: String, expected: String, suggestions: Vec<String>| {
-            Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Unknown words", detail.clone()).with(
-                &Members {
-                    parameter: ParameterMembers {
-                        parameter: Some(parameter.into()),
-                        found: Some(found),
-                        expected: Some(expected),
-                    },
-                    suggestions: Some(suggestions),
-                    ..Members::default()
-                },
-            )
+            let parameter = ParameterMembers {
+                parameter: Some(parameter.into()),
+                found: Some(found),
+                expected: Some(expected),
+            };
+            let members = Members { parameter, suggestions: Some(suggestions), ..Members::default() };
+            refused(StatusCode::UNPROCESSABLE_ENTITY, "Unknown words").with(&members)
         };
         match error {
             QueryError::Request(error) => error.into(),
             QueryError::NoScene => unavailable("No scene"),
-            QueryError::Text(TextError::Busy) | QueryError::Negatives(TextError::Busy) => {
-                unavailable("Overloaded")
+            QueryError::Unable { kind: NO_SUCH_GENERATION, title, .. } => {
+                refused(StatusCode::NOT_FOUND, title)
             }
-            QueryError::Score(ScoreError::OverBudget(OverBudget::Together { .. })) => {
-                unavailable("Overloaded")
-            }
-            QueryError::Score(ScoreError::OverBudget(_)) => {
-                Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Over budget", detail)
-            }
+            QueryError::Unable { title, .. } => refused(StatusCode::CONFLICT, title),
             QueryError::EncoderMismatch { models_name, models_id, scene_name, scene_id } => {
-                Problem::new(StatusCode::CONFLICT, kind, "Text model does not fit the scene", detail).with(
-                    &Members {
-                        models: Some(EncoderName { name: models_name, id: models_id }),
-                        scene: Some(EncoderName { name: scene_name, id: scene_id }),
-                        ..Members::default()
-                    },
-                )
+                let members = Members {
+                    models: Some(EncoderName { name: models_name, id: models_id }),
+                    scene: Some(EncoderName { name: scene_name, id: scene_id }),
+                    ..Members::default()
+                };
+                refused(StatusCode::CONFLICT, "Text model does not fit the scene").with(&members)
             }
             QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
                 match error {
@@ -155,12 +144,14 @@ impl From<QueryError> for Problem {
                     InferenceError::UnknownWords { unknown, known } => {
                         unknown_words(unknown.join(", "), "words that the model knows".into(), known)
                     }
-                    _ => Problem::internal(&detail),
+                    _ => Self::internal(&detail),
                 }
             }
-            QueryError::Text(TextError::Stopped)
-            | QueryError::Negatives(TextError::Stopped)
-            | QueryError::Score(_) => Problem::internal(&detail),
+            QueryError::Text(_) | QueryError::Negatives(_) | QueryError::Score(_) => match kind {
+                "overloaded" => unavailable("Overloaded"),
+                "over-budget" => refused(StatusCode::UNPROCESSABLE_ENTITY, "Over budget"),
+                _ => Self::internal(&detail),
+            },
         }
     }
 }

@@ -18,9 +18,8 @@ use slag_service::replies::{As, Binary, Described, Reply};
 use tokio::sync::mpsc::{Sender, channel};
 
 use super::app::App;
-use super::ask::{AskParams, ShortParams};
+use super::ask::{AskParams, ShortParams, as_in_json};
 use super::forms::AreaParams;
-use super::named::as_in_json;
 use crate::query::{AnswersOrBatch, Ask, Format, Page, RequestError};
 
 /// Longest body: 32 vectors of 2048 components as text.
@@ -62,12 +61,10 @@ pub async fn get(
 }
 
 pub async fn post(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Json<Page<'static>>>, Problem> {
-    let ask: Ask = match serde_json::from_slice(body.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&body)) {
-        Ok(ask) => ask,
-        Err(error) => return answer(&app, Err(unreadable(&error))).await.map(As::new),
-    };
-    let named = as_in_json(&ask);
-    answer(&app, Ok(ask)).await.map(As::new).map_err(named)
+    let read = serde_json::from_slice(body.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&body));
+    let ask = read.map_err(|error| unreadable(&error));
+    let named = as_in_json(ask.as_ref().ok());
+    answer(&app, ask).await.map(As::new).map_err(named)
 }
 
 /// Returns the problem of an invalid body; serde's text names the member and its allowed names.

@@ -13,7 +13,7 @@ use slag_service::routes::{Route, Routes};
 
 use super::app::App;
 use super::problem::{FAILED, Members, NO_SCENE, OTHER_MODEL, TIME_BUDGET, WORDS};
-use super::{named, position, query, status, v1};
+use super::{ask, position, query, status, v1};
 use crate::fetch::Spoken;
 
 /// This service in its help text and description.
@@ -70,7 +70,7 @@ pub(super) fn router(app: Arc<App>) -> Router {
     let reads = table.iter().filter(|route| route.reads).map(|route| route.path).collect();
     let (responses, access) =
         (Arc::clone(&app.metrics.responses), app.settings.access.clone().with_reads(reads));
-    let router = router.layer(from_fn(named::as_in_query));
+    let router = router.layer(from_fn(ask::as_in_query));
     observed(router.merge(slag_view::router()).with_state(app), responses, access)
 }
 
@@ -89,5 +89,5 @@ pub async fn serve(
         stop.await;
         stopping.stopping.send_replace(true);
     };
-    Ok(listener::serve(router(app), listener, limits, stop).await?)
+    listener::serve(router(app), listener, limits, stop).await
 }

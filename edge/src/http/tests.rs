@@ -121,18 +121,15 @@ async fn start(response: &mut std::pin::Pin<Box<impl Future<Output = Response>>>
 async fn answers_questions() {
     let service = Service::with_chair();
     let (status, headers, body) = service.get("/query?text=0&near=3,0,4&radius=20&limit=5").await;
-    assert_eq!(
-        (status, &headers["content-type"]),
-        (StatusCode::OK, &"application/json".parse().expect("a value"))
-    );
+    assert_eq!(status, StatusCode::OK);
+    assert_eq!(headers["content-type"], "application/json");
     let chair = &body["answers"][0];
     assert_eq!((&chair["rank"], &chair["id"], &chair["n_gaussians"]), (&1.into(), &"1-0".into(), &20.into()));
     assert!((chair["position_in_world"][0].as_f64().expect("a number") - 3.095).abs() < 1e-9);
     assert!((chair["distance"].as_f64().expect("a number") - 4.001).abs() < 1e-3);
-    assert_eq!(
-        (&body["scene"], &body["generation"], &body["unit"]),
-        (&"yard".into(), &1.into(), &"m".into())
-    );
+    assert_eq!(body["scene"], "yard");
+    assert_eq!(body["generation"], 1);
+    assert_eq!(body["unit"], "m");
     let (_, _, gaussians) = service.get("/query?text=0&kind=gaussians&limit=3").await;
     assert_eq!(gaussians["answers"].as_array().map(Vec::len), Some(3));
 
@@ -183,11 +180,8 @@ async fn refusals_are_problem_details() {
         let shown: String = uri.chars().take(60).collect();
         assert_eq!(found.as_u16(), status, "{shown}: {body}");
         assert_eq!(headers["content-type"], "application/problem+json", "{shown}");
-        assert_eq!(
-            (&body["parameter"], &body["status"]),
-            (&parameter.into(), &status.into()),
-            "{shown}: {body}"
-        );
+        assert_eq!(body["parameter"], parameter, "{shown}: {body}");
+        assert_eq!(body["status"], status, "{shown}: {body}");
         for member in ["type", "title", "detail", "found", "expected"] {
             assert!(
                 body[member].as_str().is_some_and(|text| !text.is_empty() && text.len() < 300),
@@ -201,10 +195,8 @@ async fn refusals_are_problem_details() {
     assert_eq!((status.as_u16(), &body["type"]), (404, &"urn:slag:problem:not-found".into()));
     assert!(headers.contains_key("x-request-id"));
     let (status, headers, body) = read(service.send("POST", "/query?text=0").await).await;
-    assert_eq!(
-        (status.as_u16(), &headers["content-type"]),
-        (405, &"application/problem+json".parse().expect("a value"))
-    );
+    assert_eq!(status.as_u16(), 405);
+    assert_eq!(headers["content-type"], "application/problem+json");
     assert_eq!((&headers["allow"], &body["status"]), (&"GET,HEAD".parse().expect("a value"), &405.into()));
 }
 
@@ -322,15 +314,12 @@ async fn tells_status_and_metrics() {
     service.get("/nowhere").await;
     let (_, _, status) = service.get("/status").await;
     assert_eq!((&status["is_ready"], &status["error"]), (&true.into(), &Value::Null));
-    assert_eq!(
-        (&status["text_model"]["name"], &status["text_model"]["execution_provider"]),
-        (&"axes".into(), &"none".into())
-    );
+    assert_eq!(status["text_model"]["name"], "axes");
+    assert_eq!(status["text_model"]["execution_provider"], "none");
     let scene = &status["scene"];
-    assert_eq!(
-        (&scene["n_gaussians"], &scene["encoder_name"], &scene["metric"]),
-        (&20.into(), &"axes".into(), &true.into())
-    );
+    assert_eq!(scene["n_gaussians"], 20);
+    assert_eq!(scene["encoder_name"], "axes");
+    assert_eq!(scene["metric"], true);
     assert_eq!((&scene["shards"][0]["cell_id"], &scene["radius"]), (&1.into(), &50.0.into()));
     let (_, headers, metrics) = service.get("/metrics").await;
     assert!(headers["content-type"].to_str().expect("text").starts_with("text/plain"));
@@ -356,15 +345,12 @@ async fn an_expired_scene_answers_and_the_status_says_so() {
         let service = Service::with_chair();
         keep_timestamp(service.dir.path(), expires_unix_secs);
         let (_, _, body) = service.get("/status").await;
-        assert_eq!(
-            (&body["is_expired"], &body["expires_unix_secs"], &body["is_ready"]),
-            (&is_expired.into(), &expires_unix_secs.into(), &true.into())
-        );
+        assert_eq!(body["is_expired"], is_expired);
+        assert_eq!(body["expires_unix_secs"], expires_unix_secs);
+        assert_eq!(body["is_ready"], true);
         let (_, _, map) = service.get("/v1/map").await;
-        assert_eq!(
-            (&map["is_expired"], &map["expires_unix_secs"]),
-            (&is_expired.into(), &expires_unix_secs.into())
-        );
+        assert_eq!(map["is_expired"], is_expired);
+        assert_eq!(map["expires_unix_secs"], expires_unix_secs);
         let (status, _, body) = service.get("/query?text=0").await;
         assert_eq!((status, &body["answers"][0]["n_gaussians"]), (StatusCode::OK, &20.into()));
     }

@@ -1,24 +1,104 @@
-//! From a checked request to ranked answers.
+//! From questions to ranked answers.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, ClusterAnswer, Clustering, Found, Relations, Searched, Whole};
+use super::answers::{Answers, ClusterAnswer, Clustering, Found, Relations, Reply, Searched, Whole};
+use super::ask::Ask;
 use super::cluster::{Cluster, Clusters, Grouping, cluster};
-use super::coverage::coverage;
-use super::engine::QueryError;
+use super::engine::{Engine, OnBoard, QueryError};
 use super::objects::{self, FoundObject, ScoredObjects};
 use super::oriented::Extent;
-use super::rank::{Order, Ranked};
 use super::reason::{self, BestObject};
 use super::relations::{self, CandidateOf, ClustersOfThing, Phrase, Things, Viewer};
-use super::request::{AnswerKind, QueryRequest, RequestError};
+use super::request::{AnswerKind, Asked, QueryRequest, RequestError, unit_vector};
 use super::scale::{Scale, ThresholdSource};
 use super::scene::{Scene, alignment, default_voxel, unit};
 use crate::score::{Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Search, score_objects};
 use slag_common::manifest::Manifest;
+
+/// Memory for the candidates of a thing: 256 of 1 kB.
+const CANDIDATES_BYTES: usize = 256 << 10;
+
+impl Engine {
+    /// Answers questions from the loaded generation. Blocks for milliseconds of computing, within the budget's time.
+    pub fn ask(&self, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
+        let on_board = self.on_board()?;
+        on_board.check()?;
+        let request = ask.in_world(&on_board.snapshot.manifest)?;
+        on_board.answer(request, budget)
+    }
+}
+
+impl OnBoard {
+    /// As [`Engine::ask`], for a request in the world frame.
+    pub fn answer(&self, mut request: QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
+        self.check()?;
+        let snapshot = &self.snapshot;
+        request.understand(snapshot)?;
+        request.check()?;
+        let negatives = self.encode_negatives(&request)?;
+        let question = |vector: Arc<[f32]>| Question { vector, negatives: negatives.clone() };
+        let scene = Scene::of(snapshot);
+        let answering = Answering { scene: &scene, request: &request, budget };
+        let mut all: Vec<Option<Answers>> = request.asked.iter().map(|_| None).collect();
+        let (mut places, mut labels, mut plain) = (Vec::new(), Vec::new(), Vec::new());
+        for (at, asked) in request.asked.iter().enumerate() {
+            let vector = match asked {
+                Asked::Text(text) => self.encode(text)?,
+                Asked::Vector { vector, .. } => vector_of(vector, snapshot.manifest.encoder.dim)?,
+                Asked::Phrase { phrase, .. } => {
+                    let things = phrase.things().into_iter();
+                    let questions = things.map(|thing| Ok(question(self.encode(thing)?)));
+                    let questions = questions.collect::<Result<Vec<_>, QueryError>>()?;
+                    let of_thing = snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES;
+                    budget.take(questions.len() * of_thing);
+                    budget.check()?;
+                    all[at] = Some(answering.related(asked.label(), phrase, &questions)?);
+                    budget.check()?;
+                    continue;
+                }
+            };
+            places.push(at);
+            labels.push(asked.label());
+            plain.push(question(vector));
+        }
+        if !plain.is_empty() {
+            let answers = answer(&scene, (labels.as_slice(), plain.as_slice()), &request, budget)?;
+            places.into_iter().zip(answers).for_each(|(at, answers)| all[at] = Some(answers));
+        }
+        let mut answers: Vec<Answers> = all.into_iter().flatten().collect();
+        for (answers, asked) in answers.iter_mut().zip(&request.asked) {
+            answers.asked_as = self.asked_as(asked, &request);
+        }
+        Ok(Reply { request, answers, snapshot: Arc::clone(snapshot) })
+    }
+
+    /// Returns the texts that replace things and negatives with words unknown to the model.
+    fn asked_as(&self, asked: &Asked, request: &QueryRequest) -> BTreeMap<String, String> {
+        let things: Vec<String> = match asked {
+            Asked::Text(text) => vec![relations::asked_thing(text).unwrap_or_else(|| text.clone())],
+            Asked::Phrase { phrase, .. } => phrase.things().into_iter().map(str::to_owned).collect(),
+            Asked::Vector { .. } => Vec::new(),
+        };
+        let negatives = request.negatives.0.iter().cloned();
+        let asked_as = |thing: String| self.text.asked_as(&thing).map(|asked| (thing, asked));
+        things.into_iter().chain(negatives).filter_map(asked_as).collect()
+    }
+}
+
+/// Returns the vector of a vector question, at unit length.
+fn vector_of(vector: &[f32], dim: u32) -> Result<Arc<[f32]>, QueryError> {
+    if vector.len() != dim as usize {
+        let found = format!("{} components", vector.len());
+        let expected = format!("{dim}, as the scene's embeddings have");
+        return Err(RequestError::new("vectors", &found, expected).into());
+    }
+    Ok(unit_vector(vector).unwrap_or_default().into())
+}
 
 /// Names of the questions, and their vectors, each with its negatives.
 type Questions<'a> = (&'a [&'a str], &'a [Question]);
@@ -45,10 +125,10 @@ pub fn answer(
 }
 
 /// A request, its scene and its budget.
-pub(super) struct Answering<'a> {
-    pub(super) scene: &'a Scene<'a>,
-    pub(super) request: &'a QueryRequest,
-    pub(super) budget: &'a Budget,
+struct Answering<'a> {
+    scene: &'a Scene<'a>,
+    request: &'a QueryRequest,
+    budget: &'a Budget,
 }
 
 impl Answering<'_> {
@@ -175,7 +255,7 @@ impl Answering<'_> {
         });
         // With negatives a score is the difference of two products.
         let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
-        let measured = search.measured_errors();
+        let likely = search.likely_error();
         let empty = self.empty(asked, scale, (threshold, source));
         let reason = || reason::of_gaussians(search, scale, self.request, threshold, n_matching);
         Answers {
@@ -184,7 +264,7 @@ impl Answering<'_> {
                 n_matching,
                 is_exact: search.is_exact(),
                 score_error_bound,
-                score_error_likely: measured.map(|errors| scale.error_bound(n_products * errors.likely)),
+                score_error_likely: likely.map(|likely| scale.error_bound(n_products * likely)),
                 clustering,
                 ..empty.searched
             },
@@ -257,12 +337,7 @@ impl Answering<'_> {
     }
 
     /// Answers a phrase. `questions`: its things, in their order.
-    pub(super) fn related(
-        &self,
-        label: &str,
-        phrase: &Phrase,
-        questions: &[Question],
-    ) -> Result<Answers, QueryError> {
+    fn related(&self, label: &str, phrase: &Phrase, questions: &[Question]) -> Result<Answers, QueryError> {
         let Self { scene, request, .. } = *self;
         let has_up = scene.manifest.metric || scene.manifest.geo_reference.is_some();
         if !has_up && needs_up(phrase) {
@@ -343,7 +418,7 @@ impl Answering<'_> {
             generation: manifest.generation,
             unit: unit(manifest),
             searched,
-            coverage: coverage(self.scene, &request.region),
+            coverage: self.scene.coverage(&request.region),
             asked_as: BTreeMap::new(),
             reason: None,
             answers: Found::Clusters(Vec::new()),
@@ -415,5 +490,52 @@ fn object_answer(
         whole,
         evidence: Some(objects::evidence(scene, object)),
         ..cluster_answer(Ranked { found: cluster, rank, relevance, distance }, scene.manifest)
+    }
+}
+
+/// Distance, in default voxels, at which an answer's relevance is halved (10 m in a metric scene).
+const VOXELS_TO_HALF_RELEVANCE: f64 = 40.0;
+
+struct Order {
+    /// The score of an unrelated thing.
+    base: f32,
+    half: f64,
+    near: Option<DVec3>,
+    limit: usize,
+}
+
+struct Ranked<T> {
+    found: T,
+    rank: usize,
+    relevance: f32,
+    distance: Option<f64>,
+}
+
+impl Order {
+    fn new(base: f32, manifest: &Manifest, request: &QueryRequest) -> Self {
+        let half = VOXELS_TO_HALF_RELEVANCE * default_voxel(manifest);
+        Self { base, half, near: request.near, limit: request.n_ranked() }
+    }
+
+    /// Ranks answers, ties in their given order, and keeps as many as asked for. `key`: reported score and position.
+    ///
+    /// The ranking key, `(score - base) / (1 + distance / half)`, and 0 below `base`, depends neither on the threshold,
+    /// which only filters, nor on another parameter. It is rounded to f32 to hide the last bits of a machine's division.
+    fn rank<T>(&self, found: Vec<T>, key: impl Fn(&T) -> (f32, DVec3)) -> Vec<Ranked<T>> {
+        let weighed = found.into_iter().map(|found| {
+            let (score, position_in_world) = key(&found);
+            let distance = self.near.map(|near| near.distance(position_in_world));
+            let margin = (f64::from(score) - f64::from(self.base)).max(0.0);
+            let relevance = (margin / (1.0 + distance.unwrap_or(0.0) / self.half)) as f32;
+            (score, Ranked { found, rank: 0, relevance, distance })
+        });
+        let mut ranked: Vec<(f32, Ranked<T>)> = weighed.collect();
+        ranked.sort_by(|(score, ranked), (other_score, other)| {
+            let nearer = || ranked.distance.unwrap_or(0.0).total_cmp(&other.distance.unwrap_or(0.0));
+            let by_relevance = other.relevance.total_cmp(&ranked.relevance);
+            by_relevance.then(other_score.total_cmp(score)).then_with(nearer)
+        });
+        ranked.truncate(self.limit);
+        ranked.into_iter().zip(1..).map(|((_, ranked), rank)| Ranked { rank, ..ranked }).collect()
     }
 }

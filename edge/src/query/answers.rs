@@ -1,6 +1,7 @@
 //! The contents of an answer.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use glam::DVec3;
 use schemars::JsonSchema;
@@ -10,13 +11,15 @@ use slag_api::UNITS;
 use slag_api::coverage::Coverage;
 use slag_api::objects::{Evidence, OrientedBox};
 use slag_common::frames::Geographic;
+use slag_common::manifest::Manifest;
 use slag_common::shard::ShardView;
 
 use super::reason::Reason;
 use super::relations::{self, Witness};
-use super::request::AnswerKind;
+use super::request::{AnswerKind, QueryRequest};
 use super::scale::{ScoreKind, ThresholdSource};
 use crate::score::{Hit, Run};
+use crate::store::Snapshot;
 
 /// Answers to one question. `answers` is the last field written, so that long lists can be sent piece by piece.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
@@ -249,6 +252,30 @@ pub struct GaussianAnswer {
     /// Distance from `near`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub distance: Option<f64>,
+}
+
+/// The answers to a request and their generation.
+pub struct Reply {
+    pub(super) snapshot: Arc<Snapshot>,
+    pub(super) request: QueryRequest,
+    /// By question.
+    pub answers: Vec<Answers>,
+}
+
+impl Reply {
+    pub fn manifest(&self) -> &Manifest {
+        &self.snapshot.manifest
+    }
+
+    pub fn gaussians(&self, answers: &Answers) -> Vec<GaussianAnswer> {
+        let Found::Gaussians(hits) = &answers.answers else { return Vec::new() };
+        hits.iter().enumerate().map(|(at, hit)| self.gaussian(at, hit)).collect()
+    }
+
+    /// Describes one Gaussian. `at`: its index in the list.
+    pub(super) fn gaussian(&self, at: usize, hit: &Hit) -> GaussianAnswer {
+        GaussianAnswer::new(at, hit, &self.snapshot.shards[hit.shard as usize].view(), self.request.near)
+    }
 }
 
 impl GaussianAnswer {

@@ -20,8 +20,7 @@ use arrow_array::{ArrayRef, Float32Array, Float64Array, RecordBatch, UInt32Array
 use arrow_ipc::writer::StreamWriter;
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 
-use super::answers::Found;
-use super::reply::Reply;
+use super::answers::{Found, Reply};
 use crate::score::Hit;
 
 /// Rows per batch: half a megabyte.

@@ -27,37 +27,11 @@ pub struct ChangesRequest {
     pub texts: Vec<String>,
 }
 
-#[derive(Debug, thiserror::Error)]
-pub enum ChangesError {
-    #[error(transparent)]
-    Query(#[from] QueryError),
-    #[error("generation {wanted} is not remembered; those that are: {}", list(known))]
-    NoSuchGeneration { wanted: u64, known: Vec<u64> },
-    #[error(
-        "generations {from} and {to} were encoded with different models, so that their things do not compare"
-    )]
-    Encoders { from: u64, to: u64 },
-    #[error(
-        "generation {0} has no objects on board to compare; encode the scene without --no-objects, publish it, and fetch it again"
-    )]
-    NoObjects(u64),
-}
+/// A generation that was asked for is not remembered.
+pub const NO_SUCH_GENERATION: &str = "no-such-generation";
 
-fn list(generations: &[u64]) -> String {
-    let numbers: Vec<String> = generations.iter().map(u64::to_string).collect();
-    numbers.join(", ")
-}
-
-impl ChangesError {
-    /// Stable name of the error's kind, for programs.
-    pub fn kind(&self) -> &'static str {
-        match self {
-            Self::Query(error) => error.kind(),
-            Self::NoSuchGeneration { .. } => "no-such-generation",
-            Self::Encoders { .. } => "encoders-differ",
-            Self::NoObjects(_) => "no-objects",
-        }
-    }
+fn incomparable(kind: &'static str, detail: String) -> QueryError {
+    QueryError::Unable { kind, title: "Generations do not compare", detail }
 }
 
 impl Engine {
@@ -65,8 +39,8 @@ impl Engine {
     /// if thousands of things changed.
     ///
     /// # Errors
-    /// [`ChangesError`]. That nothing is remembered yet is a reply.
-    pub fn changes(&self, request: &ChangesRequest, budget: &Budget) -> Result<ChangesReply, ChangesError> {
+    /// [`QueryError`]. That nothing is remembered yet is a reply.
+    pub fn changes(&self, request: &ChangesRequest, budget: &Budget) -> Result<ChangesReply, QueryError> {
         let on_board = self.on_board()?;
         let snapshot = &on_board.snapshot;
         let manifest = &snapshot.manifest;
@@ -79,15 +53,14 @@ impl Engine {
         let of_thing =
             size_of::<Thing>() + size_of::<ChangedThing>() + size_of::<f64>() * manifest.encoder.dim as usize;
         budget.take(2 * of_thing * snapshot.objects.len());
-        budget.check().map_err(QueryError::from)?;
+        budget.check()?;
         let generations = known(self.cache(), manifest);
         let to = generation(self.cache(), snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
         let from = match request.from {
             _ if generations.iter().all(|of| *of >= to.generation) => None,
             Some(from) if from >= to.generation => {
                 let expected = format!("less than {}, the generation to compare with", to.generation);
-                let error = RequestError::new("from", &from.to_string(), expected);
-                return Err(QueryError::from(error).into());
+                return Err(RequestError::new("from", &from.to_string(), expected).into());
             }
             Some(from) => Some(generation(self.cache(), snapshot, from, &generations)?),
             None => {
@@ -98,9 +71,13 @@ impl Engine {
         if let Some(from) = &from
             && from.encoder_id != to.encoder_id
         {
-            return Err(ChangesError::Encoders { from: from.generation, to: to.generation });
+            let detail = format!(
+                "generations {} and {} were encoded with different models, so that their things do not compare",
+                from.generation, to.generation
+            );
+            return Err(incomparable("encoders-differ", detail));
         }
-        budget.check().map_err(QueryError::from)?;
+        budget.check()?;
         Ok(reply(from, to, manifest, generations, request, &words))
     }
 }
@@ -118,11 +95,15 @@ fn generation(
     snapshot: &Snapshot,
     wanted: u64,
     known: &[u64],
-) -> Result<Record, ChangesError> {
+) -> Result<Record, QueryError> {
     let Snapshot { manifest, current, bad_cells, .. } = snapshot;
     let remembered = history::read(cache, &manifest.scene, wanted);
     if wanted != manifest.generation {
-        return remembered.ok_or_else(|| ChangesError::NoSuchGeneration { wanted, known: known.to_vec() });
+        return remembered.ok_or_else(|| {
+            let known = known.iter().map(u64::to_string).collect::<Vec<_>>().join(", ");
+            let detail = format!("generation {wanted} is not remembered; those that are: {known}");
+            QueryError::Unable { kind: NO_SUCH_GENERATION, title: "No such generation", detail }
+        });
     }
     // The shards of earlier generations that stand in for bad cells say nothing about this one.
     let is_own = |cell_id: u32| !bad_cells.iter().any(|bad| bad.cell_id == cell_id);
@@ -132,7 +113,12 @@ fn generation(
     match (remembered, on_board) {
         (Some(remembered), Some(on_board)) => Ok(remembered.with(on_board)),
         (None, Some(record)) | (Some(record), None) => Ok(record),
-        (None, None) => Err(ChangesError::NoObjects(wanted)),
+        (None, None) => Err(incomparable(
+            "no-objects",
+            format!(
+                "generation {wanted} has no objects on board to compare; encode the scene without --no-objects, publish it, and fetch it again"
+            ),
+        )),
     }
 }
 

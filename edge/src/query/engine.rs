@@ -14,7 +14,7 @@ use super::relations;
 use super::request::{QueryRequest, RequestError, check_text};
 use crate::score::{OverBudget, ScoreError};
 use crate::store::files::Stat;
-use crate::store::{EdgeCache, Snapshot, StoreError, damaged};
+use crate::store::{EdgeCache, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextOpenError, TextService};
 
 /// Retry interval of a failed load while `current` is unchanged: disk full, too many open files.
@@ -36,6 +36,9 @@ pub enum QueryError {
     EncoderMismatch { models_name: String, models_id: Hash32, scene_name: String, scene_id: Hash32 },
     #[error(transparent)]
     Score(#[from] ScoreError),
+    /// What is on board has nothing to answer from. `kind` and `title` are stable names.
+    #[error("{detail}")]
+    Unable { kind: &'static str, title: &'static str, detail: String },
 }
 
 impl From<OverBudget> for QueryError {
@@ -61,6 +64,7 @@ impl QueryError {
             Self::Score(ScoreError::OverBudget(OverBudget::Together { .. })) => "overloaded",
             Self::Score(ScoreError::OverBudget(_)) => "over-budget",
             Self::Score(_) => "score",
+            Self::Unable { kind, .. } => kind,
         }
     }
 }
@@ -232,12 +236,8 @@ fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions
         tracing::warn!("the scene's text model does not open: {}", crate::error_line(error));
     };
     let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
+    let read = read.and_then(|bytes| StoreError::check_hash(&path, expected, &bytes).map(|()| bytes));
     let bytes = read.inspect_err(|e| failed(e.is_damage(), e)).ok()?;
-    let found = Hash32::of(&bytes);
-    if found != expected {
-        failed(true, &StoreError::Hash { path, expected, found });
-        return None;
-    }
     let folder = path.parent().unwrap_or(cache.dir());
     let opened = ModelDir::carried(&bytes, &path, folder)
         .map_err(TextOpenError::Model)
@@ -256,7 +256,7 @@ fn mark_damaged(cache: &EdgeCache, record: &TextModelRecord) {
     for object in record.objects() {
         let read = cache.files().read(&cache.shard_path(object.hash), object.len_bytes);
         if !read.is_ok_and(|bytes| Hash32::of(&bytes) == object.hash) {
-            damaged::mark(cache, object.hash);
+            cache.mark_damaged(object.hash);
         }
     }
 }

@@ -6,9 +6,8 @@ use std::sync::Arc;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::answers::Found;
+use super::answers::{Found, Reply};
 use super::ply;
-use super::reply::Reply;
 
 #[cfg(feature = "arrow")]
 use super::arrow;

@@ -1,7 +1,6 @@
 //! From a question to ranked answers.
 
 mod answer;
-mod answering;
 mod answers;
 mod area;
 #[cfg(feature = "arrow")]
@@ -9,21 +8,17 @@ mod arrow;
 mod ask;
 mod changes;
 pub mod cluster;
-mod coverage;
 mod engine;
 mod format;
 mod inventory;
 mod listing;
 mod names;
-mod naming;
 mod objects;
 mod oriented;
 mod page;
 mod ply;
-mod rank;
 mod reason;
 pub mod relations;
-mod reply;
 mod request;
 mod scale;
 mod scene;
@@ -31,19 +26,19 @@ mod status;
 mod view;
 
 pub use answer::answer;
-pub use answers::{Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Searched};
+pub use answers::{
+    Answers, AnswersOrBatch, ClusterAnswer, Clustering, Found, GaussianAnswer, Reply, Searched,
+};
 pub use area::{Area, AreaBall, AreaBox, Corner, LatLon, Point};
 pub use ask::Ask;
-pub use changes::{ChangesError, ChangesRequest};
-pub(crate) use coverage::coverage;
+pub use changes::{ChangesRequest, NO_SUCH_GENERATION};
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
+pub(crate) use inventory::NAMES_WAIT;
 pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder};
 pub use listing::ListFormat;
-pub(crate) use naming::NAMES_WAIT;
 pub use page::Page;
 pub use reason::{Reason, ReasonKind};
-pub use reply::Reply;
 pub use request::{
     AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, LENGTHS, MAX_CLUSTERS,
     MAX_GAUSSIANS, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, Words,

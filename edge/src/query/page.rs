@@ -1,6 +1,5 @@
 //! A page of answers: version 1's only reply type.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use glam::DVec3;
@@ -9,10 +8,9 @@ use serde::Serialize;
 use slag_api::coverage::Coverage;
 use slag_api::{FRAME, UNITS};
 
-use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, Searched};
+use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, Reply, Searched};
 use super::reason::{Reason, ReasonKind};
 use super::relations::{self, Phrase, Witness};
-use super::reply::Reply;
 use super::request::{AnswerKind, Asked};
 use super::scene::unit;
 
@@ -55,41 +53,39 @@ struct Described<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     parts: Option<&'a [relations::Found]>,
     /// Why nothing was found; null if something was.
-    none: Option<Nothing<'a>>,
+    none: Option<Nothing>,
     /// `offset` of the next page; null if there is none.
     next_offset: Option<usize>,
     /// The answers, best first.
     answers: Vec<Answer<'a>>,
 }
 
-/// A question as the client wrote it: one of the members.
-#[derive(Default, Serialize, JsonSchema)]
+/// A question as the client wrote it.
+#[derive(Serialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
 #[schemars(rename = "Question")]
-struct AskedFor<'a> {
+enum AskedFor<'a> {
     /// A text.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    text: Option<&'a str>,
+    Text(&'a str),
     /// The index of a vector in the request.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    vector: Option<usize>,
+    Vector(usize),
     /// A phrase.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    phrase: Option<&'a Phrase>,
+    Phrase(&'a Phrase),
 }
 
 /// Why nothing was found.
 #[derive(Serialize, JsonSchema)]
 #[schemars(rename = "None")]
-struct Nothing<'a> {
+struct Nothing {
     /// The reason.
     kind: ReasonKind,
     /// The same in words.
-    detail: Cow<'a, str>,
+    detail: String,
     /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
     #[serde(skip_serializing_if = "Option::is_none")]
     seen_share: Option<f64>,
     /// The part of a phrase that failed.
-    thing: Option<&'a str>,
+    thing: Option<Box<str>>,
     /// Best score found.
     best_score: Option<f32>,
     /// Greatest degree of the relation among all pairs; it holds from 0.5.
@@ -151,29 +147,23 @@ impl<'a> Page<'a> {
     }
 }
 
-impl<'a> AskedFor<'a> {
-    /// Returns a question, and the phrase that it was understood as.
-    fn new(asked: &'a Asked) -> (Self, Option<&'a Phrase>) {
-        let of_text = |text| Self { text: Some(text), ..Self::default() };
-        match asked {
-            Asked::Text(text) => (of_text(text), None),
-            Asked::Vector { at, .. } => (Self { vector: Some(*at), ..Self::default() }, None),
-            Asked::Phrase { text: Some(text), phrase } => (of_text(text), Some(phrase)),
-            Asked::Phrase { text: None, phrase } => {
-                (Self { phrase: Some(phrase), ..Self::default() }, Some(phrase))
-            }
-        }
-    }
-}
-
 impl<'a> Described<'a> {
     fn new(reply: &Reply, asked: &'a Asked, found: &'a Answers) -> Self {
-        let (question, understood) = AskedFor::new(asked);
+        let (question, understood) = match asked {
+            Asked::Text(text) => (AskedFor::Text(text), None),
+            Asked::Vector { at, .. } => (AskedFor::Vector(*at), None),
+            Asked::Phrase { text: Some(text), phrase } => (AskedFor::Text(text), Some(phrase)),
+            Asked::Phrase { text: None, phrase } => (AskedFor::Phrase(phrase), Some(phrase)),
+        };
         let (offset, limit) = (reply.request.offset, reply.request.page());
         let end = offset.saturating_add(limit);
         let generation = reply.manifest().generation;
         let n = found.answers.len();
-        let beyond = (n > 0 && offset >= n).then(|| Nothing::beyond(offset, n));
+        let beyond = || {
+            let advice = "is beyond them: give a smaller one";
+            Reason::new(ReasonKind::BeyondEnd, format!("{n} answers in all, offset {offset} {advice}"))
+        };
+        let none = found.reason.clone().or_else(|| (n > 0 && offset >= n).then(beyond));
         let related = found.related.as_ref();
         let thing = |(at, cluster): (usize, &'a ClusterAnswer)| {
             let to = related.map(|related| &related.to[at]);
@@ -196,35 +186,17 @@ impl<'a> Described<'a> {
             searched: related.is_none().then_some(&found.searched),
             coverage: &found.coverage,
             parts: related.map(|related| &*related.parts),
-            none: found.reason.as_ref().map(Nothing::new).or(beyond),
+            none: none.map(Nothing::from),
             next_offset: (n > end).then_some(end),
             answers,
         }
     }
 }
 
-impl<'a> Nothing<'a> {
-    fn new(reason: &'a Reason) -> Self {
-        Self {
-            kind: reason.kind,
-            detail: Cow::Borrowed(&reason.detail),
-            seen_share: reason.seen_share,
-            thing: reason.thing.as_deref(),
-            best_score: reason.best_score,
-            best_degree: reason.best_degree,
-            best_position_in_world: reason.best_position_in_world,
-        }
-    }
-
-    fn beyond(offset: usize, n: usize) -> Self {
-        Self {
-            kind: ReasonKind::BeyondEnd,
-            detail: format!("{n} answers in all, offset {offset} is beyond them: give a smaller one").into(),
-            seen_share: None,
-            thing: None,
-            best_score: None,
-            best_degree: None,
-            best_position_in_world: None,
-        }
+impl From<Reason> for Nothing {
+    fn from(reason: Reason) -> Self {
+        let Reason { kind, detail, seen_share, best_score, best_position_in_world, thing, best_degree } =
+            reason;
+        Self { kind, detail, seen_share, thing, best_score, best_degree, best_position_in_world }
     }
 }

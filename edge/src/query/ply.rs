@@ -5,8 +5,7 @@ use std::sync::Arc;
 
 use slag_common::splat::ply::{Point, PointProperties};
 
-use super::answers::{Answers, Found};
-use super::reply::Reply;
+use super::answers::{Answers, Found, Reply};
 use super::scene::unit;
 use crate::score::Run;
 

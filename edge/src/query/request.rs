@@ -93,10 +93,7 @@ pub fn is_length(length: f64) -> bool {
 
 /// Checks a length. `parameter`: its name, for the error.
 pub fn check_length(parameter: &str, length: f64) -> Result<(), RequestError> {
-    match is_length(length) {
-        true => Ok(()),
-        false => Err(RequestError::new(parameter, &length.to_string(), LENGTHS)),
-    }
+    if is_length(length) { Ok(()) } else { Err(RequestError::new(parameter, &length.to_string(), LENGTHS)) }
 }
 
 fn is_within(point: DVec3) -> bool {
@@ -395,52 +392,4 @@ pub fn check_text(parameter: &str, text: &str) -> Result<(), RequestError> {
         return Err(RequestError::new(parameter, text, "no control characters"));
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn points_parse_or_say_what_they_should_be() {
-        assert_eq!(parse_point("1, -2.5,3e2"), Ok(DVec3::new(1.0, -2.5, 300.0)));
-        for bad in ["", "1,2", "1,2,3,4", "1,2,x", "NaN,0,0", "inf,0,0", "0,0,1e10"] {
-            assert!(parse_point(bad).is_err(), "{bad}");
-        }
-    }
-
-    /// Lists and questions have the same limits.
-    #[test]
-    fn lengths_and_regions_keep_their_limits() {
-        assert_eq!(LENGTHS, format!("more than 0, at most {MAX_COORDINATE:e}"));
-        assert!(is_length(1e-9) && is_length(1e9));
-        for bad in [0.0, -1.0, 1e10, f64::INFINITY, f64::NAN] {
-            let ball = Some(Ball { centre_in_world: DVec3::ZERO, radius: bad });
-            let refused = check_region(&Region { ball, ..Region::default() }).expect_err("a wrong radius");
-            assert_eq!((refused.parameter.as_str(), refused.expected.as_str()), ("radius", LENGTHS));
-        }
-        for max in [DVec3::new(1.0, 1.0, 0.0), DVec3::new(1.0, -1.0, 1.0), DVec3::new(1.0, 1.0, 1e10)] {
-            let bounds = Some(Aabb { min: DVec3::ZERO, max });
-            let refused = check_region(&Region { bounds, ..Region::default() }).expect_err("no box");
-            assert_eq!(refused.parameter, "box", "{max}");
-        }
-        assert_eq!(check_region(&Region::default()), Ok(()));
-    }
-
-    #[test]
-    fn negatives_and_boxes_parse_or_say_what_they_should_be() {
-        assert_eq!("none".parse(), Ok(Negatives::default()));
-        let canonical = CANONICAL_NEGATIVES.map(str::to_owned).to_vec();
-        assert_eq!(" canonical".parse(), Ok(Negatives(canonical)));
-        let phrases = Negatives(vec!["white wall".into(), "floor".into()]);
-        assert_eq!("white wall, floor".parse(), Ok(phrases));
-        for bad in ["", ",", "wall,,floor", &["x"; MAX_NEGATIVES + 1].join(",")] {
-            assert!(bad.parse::<Negatives>().is_err(), "{bad}");
-        }
-        let bounds = Aabb { min: DVec3::new(-1.0, 0.0, 2.0), max: DVec3::new(4.0, 5.0, 3.0) };
-        assert_eq!(parse_box("4,0, 3,-1,5,2"), Ok(bounds));
-        for bad in ["", "1,2,3", "1,2,3,4,5", "1,2,3,4,5,6,7", "0,0,0,1,1,NaN", "0,0,0,1,1,1e10"] {
-            assert!(parse_box(bad).is_err(), "{bad}");
-        }
-    }
 }

@@ -2,14 +2,17 @@
 
 use glam::DVec3;
 use slag_api::UNITS;
+use slag_api::coverage::{BadCellAnswer, Coverage};
 use slag_api::objects::Alignment;
+use slag_common::frames::Aabb;
 use slag_common::manifest::Manifest;
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
 use slag_math::stats::median;
 
+use crate::score::Region;
 use crate::store::objects::ObjectIndex;
-use crate::store::{BadCell, Snapshot};
+use crate::store::{BadCell, Snapshot, cell_of};
 
 /// Voxel edge in a metric scene, metres: parts of a piece of furniture are within two edges, two pieces mostly not.
 const METRIC_VOXEL_M: f64 = 0.25;
@@ -38,6 +41,26 @@ impl<'a> Scene<'a> {
             fetched: (snapshot.current.centre_in_world, snapshot.current.radius),
             bad_cells: &snapshot.bad_cells,
         }
+    }
+
+    /// Returns how much of a region is on board.
+    pub(crate) fn coverage(&self, region: &Region) -> Coverage {
+        let touches = |bad: &&BadCell| {
+            cell_of(self.manifest, bad.cell_id).is_none_or(|cell| region.touches(&cell.bounds))
+        };
+        let described = |bad: &BadCell| BadCellAnswer {
+            cell_id: bad.cell_id,
+            generation: bad.old.map(|old| old.generation),
+        };
+        let bad_cells: Vec<BadCellAnswer> = self.bad_cells.iter().filter(touches).map(described).collect();
+        // The whole region is surely on board if all of ball or box is, as their intersection counts.
+        let (centre, radius) = self.fetched;
+        let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);
+        let reach = |b: &Aabb| (b.min - centre).abs().max((b.max - centre).abs()).length();
+        let bounds = region.bounds.map(|bounds| reach(&bounds) <= radius);
+        let is_fetched = ball.into_iter().chain(bounds).reduce(|a, b| a || b);
+        let are_there = bad_cells.iter().all(|bad| bad.generation.is_some());
+        Coverage { area_fetched: is_fetched.map(|is_fetched| is_fetched && are_there), bad_cells }
     }
 }
 

@@ -7,7 +7,7 @@ use slag_api::FRAME;
 use slag_api::map::{MapCell, MapStatus, MissingCell};
 use slag_common::Hash32;
 use slag_common::frames::{Aabb, GeoReference};
-use slag_common::shard::Profile;
+use slag_common::shard::{Profile, ShardHeader};
 
 use super::scene::unit;
 use crate::store::{BadCell, Snapshot};
@@ -68,20 +68,11 @@ pub struct ShardStatus {
 impl Status {
     pub fn of(snapshot: &Snapshot) -> Self {
         let Snapshot { current, manifest, .. } = snapshot;
-        let shards: Vec<ShardStatus> = snapshot
-            .shards
-            .iter()
-            .map(|shard| {
-                let header = shard.view().header;
-                let (cell_id, len_bytes) = (header.cell_id, shard.len_bytes());
-                ShardStatus {
-                    cell_id,
-                    n_gaussians: header.n_gaussians,
-                    n_centroids: header.n_centroids,
-                    len_bytes,
-                }
-            })
-            .collect();
+        let shards = snapshot.shards.iter().map(|shard| {
+            let ShardHeader { cell_id, n_gaussians, n_centroids, .. } = shard.view().header;
+            ShardStatus { cell_id, n_gaussians, n_centroids, len_bytes: shard.len_bytes() }
+        });
+        let shards: Vec<ShardStatus> = shards.collect();
         Self {
             scene: manifest.scene.clone(),
             generation: manifest.generation,

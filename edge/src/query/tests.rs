@@ -77,10 +77,9 @@ fn clusters_are_ranked_nearest_best() {
     let yard = yard();
     let answers = ask(&yard, |_, _| ());
     assert_eq!((answers.searched.n_searched, answers.searched.n_matching, answers.unit), (724, 224, "m"));
-    assert_eq!(
-        (answers.reason.as_ref(), answers.coverage.area_fetched, answers.searched.is_exact),
-        (None, None, false)
-    );
+    assert_eq!(answers.reason.as_ref(), None);
+    assert_eq!(answers.coverage.area_fetched, None);
+    assert!(!answers.searched.is_exact);
     let found = clusters(&answers);
     // Equal things without an asker: ordered by first Gaussian. Four Gaussians are too few.
     assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0", "5-0"]);
@@ -228,10 +227,9 @@ fn gaussians_come_best_then_nearest_first() {
     let names: Vec<(u32, u32)> = found.iter().map(|g| (g.cell_id, g.index)).collect();
     // Cell 6 has the best scores, its Gaussians in order of x; then the two things tie, the nearer one first.
     assert_eq!(names, [(6, 3), (6, 2), (6, 1), (6, 0), (3, 35), (3, 36), (3, 34)]);
-    assert_eq!(
-        (answers.searched.n_matching, found[0].input_index, answers.searched.clustering.is_none()),
-        (224, None, true)
-    );
+    assert_eq!(answers.searched.n_matching, 224);
+    assert_eq!(found[0].input_index, None);
+    assert!(answers.searched.clustering.is_none());
 }
 
 #[test]
@@ -282,10 +280,8 @@ fn negatives_make_relevancies() {
     };
     let answers = ask(|_| ());
     assert_eq!((answers.searched.score_kind, answers.searched.threshold), (ScoreKind::Relevancy, 0.5));
-    assert_eq!(
-        (answers.searched.threshold_source, &answers.searched.negatives[0][..]),
-        (ThresholdSource::Relevancy, "other")
-    );
+    assert_eq!(answers.searched.threshold_source, ThresholdSource::Relevancy);
+    assert_eq!(&answers.searched.negatives[0][..], "other");
     // 0.7 is nearer to the other axis.
     assert_eq!(answers.searched.n_matching, 204);
     let found = clusters(&answers);
@@ -293,10 +289,8 @@ fn negatives_make_relevancies() {
     let bound = f64::from(answers.searched.score_error_bound);
     assert!((f64::from(found[0].score) - expected(0.9)).abs() <= bound && bound < 0.02, "{bound}");
     let answers = ask(|request| request.threshold = Some(0.4));
-    assert_eq!(
-        (answers.searched.n_matching, answers.searched.threshold_source),
-        (224, ThresholdSource::Request)
-    );
+    assert_eq!(answers.searched.n_matching, 224);
+    assert_eq!(answers.searched.threshold_source, ThresholdSource::Request);
     let all = ask(|request| (request.threshold, request.kind) = (Some(0.0), Some(AnswerKind::Gaussians)));
     assert_eq!(all.searched.n_matching, 724);
     let best = &described(&yard, &all, None)[0];
@@ -374,15 +368,11 @@ fn boxes_are_upright_where_up_is_known() {
 #[test]
 fn thresholds_say_where_they_come_from() {
     let answers = ask(&yard(), |request, _| request.threshold = Some(0.2));
-    assert_eq!(
-        (answers.searched.threshold, answers.searched.threshold_source),
-        (0.2, ThresholdSource::Request)
-    );
+    assert_eq!(answers.searched.threshold, 0.2);
+    assert_eq!(answers.searched.threshold_source, ThresholdSource::Request);
     let answers = ask(&yard(), |_, manifest| manifest.encoder.default_threshold = 0.8);
-    assert_eq!(
-        (answers.searched.threshold, answers.searched.threshold_source),
-        (0.8, ThresholdSource::Encoder)
-    );
+    assert_eq!(answers.searched.threshold, 0.8);
+    assert_eq!(answers.searched.threshold_source, ThresholdSource::Encoder);
     assert_eq!((answers.searched.n_matching, answers.searched.score_kind), (204, ScoreKind::Cosine));
 }
 

@@ -8,7 +8,7 @@ use slag_view::{
 };
 
 use super::engine::{Engine, QueryError};
-use super::naming::NAMES_WAIT;
+use super::inventory::NAMES_WAIT;
 use super::request::{Negatives, QueryRequest};
 use super::scene::Scene;
 use super::status::map_status;
@@ -38,14 +38,14 @@ impl Engine {
             n_gaussians: cell.n_gaussians,
             state: if cell.generation == map.generation { CellState::OnBoard } else { CellState::Stale },
             generation: cell.generation,
-            box_m: slag_view::Corners { min: cell.box_min_in_world, max: cell.box_max_in_world },
+            box_m: cell.bounds().into(),
         });
         let missing = map.missing.iter().map(|cell| Cell {
             cell: cell.cell_id,
             n_gaussians: 0,
             state: CellState::Missing,
             generation: map.generation,
-            box_m: slag_view::Corners { min: cell.box_min_in_world, max: cell.box_max_in_world },
+            box_m: cell.bounds().into(),
         });
         let mut cells: Vec<Cell> = known.chain(missing).collect();
         cells.sort_by_key(|cell| cell.cell);

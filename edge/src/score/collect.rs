@@ -8,9 +8,8 @@ use slag_common::shard::{BLOCK, Residuals, ShardView};
 
 use super::cell::{Cell, Detail, Measured};
 use super::dot::EmbeddingTimesVector;
-use super::matches::{Matches, Run};
 use super::region::Region;
-use super::search::{Search, combine};
+use super::search::{Matches, Run, Search, combine};
 use super::simd::{BlockSums, FindSums, LastBlock, RowsTimesVector};
 
 /// Number of bins; counting locates a rank's score before anything is sorted.
@@ -70,9 +69,7 @@ impl Search<'_> {
         for Gather { found, .. } in self.collect(Cut { score: threshold, least: threshold }, false) {
             all.runs.extend_from_slice(&found.runs);
             all.n_gaussians += found.n_gaussians;
-            all.n_centroids_undecided += found.n_centroids_undecided;
             all.effort += found.effort;
-            all.n_shards_below += found.n_shards_below;
         }
         all
     }
@@ -111,7 +108,6 @@ impl Cell<'_> {
             Detail::Measured(Measured { code_margin, .. }) if !gather.is_counting => code_margin,
             _ => 0.0,
         };
-        let mut is_reachable = false;
         for centroid in 0..self.centroids.len() {
             if self.centroids[centroid] < floor {
                 continue;
@@ -120,9 +116,7 @@ impl Cell<'_> {
             if upper + margin < cut.score {
                 continue;
             }
-            is_reachable = true;
-            let is_undecided = lower - margin < cut.score;
-            let is_scanned = is_undecided || each;
+            let is_scanned = lower - margin < cut.score || each;
             let members = self.shard.centroid_starts[centroid] as usize
                 ..self.shard.centroid_starts[centroid + 1] as usize;
             for inside in runs_inside(self.shard, self.filter.as_ref(), members) {
@@ -144,9 +138,7 @@ impl Cell<'_> {
                     _ => self.push(gather, inside, self.centroids[centroid]),
                 }
             }
-            gather.found.n_centroids_undecided += u64::from(is_undecided);
         }
-        gather.found.n_shards_below = usize::from(!is_reachable);
     }
 
     fn push(&self, gather: &mut Gather, members: Range<usize>, score: f32) {

@@ -17,7 +17,6 @@ mod budget;
 mod cell;
 mod collect;
 mod dot;
-mod matches;
 mod objects;
 mod project;
 mod question;
@@ -28,11 +27,10 @@ mod simd;
 
 pub use budget::{Budget, MAX_COORDINATE, OverBudget, Pool, ScoreError};
 pub use dot::{dot, rounding_bound};
-pub use matches::{Effort, Hit, Matches, Run};
 pub use objects::{ObjectScores, score_objects};
 pub use question::{Precision, Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 pub use region::{Ball, MAX_CORNERS, Polygon, Region};
-pub use search::Search;
+pub use search::{Effort, Hit, Matches, Run, Search};
 
 #[cfg(test)]
 mod coded_tests;

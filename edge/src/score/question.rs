@@ -39,12 +39,17 @@ impl Question {
         let dim = self.vector.len();
         for vector in self.vectors() {
             if vector.len() != dim {
-                return Err(ScoreError::Negative { expected: dim, found: vector.len() });
+                return Err(ScoreError::Unfit(format!(
+                    "a negative has {} components, but the query vector has {dim}; encode both with the same text model",
+                    vector.len()
+                )));
             }
             let found = length(vector.iter().copied()) as f32;
             // Text models normalise in f32, or read f16 tables.
             if found.is_nan() || (found - 1.0).abs() > 1e-3 {
-                return Err(ScoreError::NotUnit { found });
+                return Err(ScoreError::Unfit(format!(
+                    "the query vector has length {found}, expected 1; the text model is damaged or does not normalise its vectors"
+                )));
             }
         }
         Ok(())
@@ -71,15 +76,19 @@ pub(super) fn check(shards: &[ShardView<'_>], questions: &[Question]) -> Result<
     for question in questions {
         question.check()?;
         for shard in shards {
-            let header = &shard.header;
-            let (expected, found) = (header.dim as usize, question.vector.len());
+            let (cell_id, expected) = (shard.header.cell_id, shard.header.dim as usize);
+            let found = question.vector.len();
             if expected != found {
-                return Err(ScoreError::Dimension { cell_id: header.cell_id, expected, found });
+                return Err(ScoreError::Unfit(format!(
+                    "cell {cell_id} holds embeddings of {expected} components, but the query vector has {found}; use the models that the scene was encoded with"
+                )));
             }
             let reach = shard.position_box();
             let found = reach.min.abs().max(reach.max.abs()).max_element();
             if found.is_nan() || found > MAX_COORDINATE {
-                return Err(ScoreError::Extent { cell_id: header.cell_id, found });
+                return Err(ScoreError::Unfit(format!(
+                    "cell {cell_id}: positions reach {found:e}, the limit is {MAX_COORDINATE:e} world units; encode the scene again around a nearer origin"
+                )));
             }
         }
     }

@@ -1,15 +1,60 @@
-//! Searches: one or several questions over a set of shards, begun by scoring all centroids.
+//! Searches: one or several questions over a set of shards, begun by scoring all centroids; and what they find.
 
 use std::sync::Arc;
 
 use rayon::prelude::*;
-use slag_common::shard::{ScoreErrors, ShardView};
+use slag_common::shard::ShardView;
 use slag_math::simd::InstructionSet;
 
 use super::budget::{Budget, ScoreError};
 use super::project::{Projection, Vector};
 use super::question::{Precision, Question, check};
 use super::region::Region;
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hit {
+    /// Index of the shard in the searched slice.
+    pub shard: u32,
+    pub index: u32,
+    /// The Gaussian's own score if the shard has a code or embedding that the precision uses; else its centroid's.
+    pub score: f32,
+}
+
+/// Adjacent matching Gaussians of one shard that share a score.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Run {
+    /// Index of the shard in the searched slice.
+    pub shard: u32,
+    pub start: u32,
+    /// One past the last member.
+    pub end: u32,
+    /// Score of the centroid, or of a Gaussian scored individually.
+    pub score: f32,
+}
+
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Matches {
+    /// Disjoint runs, by shard and start, ascending.
+    pub runs: Vec<Run>,
+    pub n_gaussians: u64,
+    pub effort: Effort,
+}
+
+/// Work done beyond scoring centroids.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Effort {
+    pub n_rescored: u64,
+    pub n_fine_read: u64,
+    pub n_embeddings_read: u64,
+}
+
+impl std::ops::AddAssign for Effort {
+    fn add_assign(&mut self, other: Self) {
+        self.n_rescored += other.n_rescored;
+        self.n_fine_read += other.n_fine_read;
+        self.n_embeddings_read += other.n_embeddings_read;
+    }
+}
 
 /// One question's centroid scores over a set of shards, for several kinds of answers.
 pub struct Search<'a> {
@@ -89,27 +134,21 @@ impl<'a> Search<'a> {
         self.shards.iter().zip(&*self.scored).filter_map(|(shard, scores)| scores.as_ref().map(|_| shard))
     }
 
-    /// Returns the score errors measured over a bank of texts, each the maximum over the shards searched, so that the
-    /// likely one holds for each; `None` if answers are exact, or a shard lacks measurements for the data read.
-    pub(crate) fn measured_errors(&self) -> Option<ScoreErrors> {
-        let mut largest: Option<ScoreErrors> = None;
+    /// Returns the likely score error measured over a bank of texts, the largest of the shards searched; `None` if
+    /// answers are exact, or a shard lacks measurements for the data read.
+    pub(crate) fn likely_error(&self) -> Option<f32> {
+        let mut largest = None;
         for shard in self.searched() {
             let of_codes = match self.precision {
                 Precision::Centroids => shard.residuals.is_none() && shard.exact.is_none(),
                 Precision::Measured => true,
                 Precision::Exact => shard.exact.is_none(),
             };
-            let errors = shard.header.errors;
-            if !of_codes || errors.likely == 0.0 {
+            let likely = shard.header.errors.likely;
+            if !of_codes || likely == 0.0 {
                 return None;
             }
-            let of = largest.unwrap_or(errors);
-            largest = Some(ScoreErrors {
-                mean: of.mean.max(errors.mean),
-                likely: of.likely.max(errors.likely),
-                max: of.max.max(errors.max),
-                spread: of.spread.max(errors.spread),
-            });
+            largest = Some(likely.max(largest.unwrap_or(0.0)));
         }
         largest
     }

@@ -5,8 +5,7 @@ use rayon::prelude::*;
 
 use super::cell::Cell;
 use super::collect::{BINS, Cut, Gather, bin_of, edge_of, runs_inside};
-use super::matches::{Hit, Run};
-use super::search::Search;
+use super::search::{Hit, Run, Search};
 
 impl Search<'_> {
     /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from `near`,

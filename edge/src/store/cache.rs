@@ -1,16 +1,19 @@
-//! A cache folder and the generation pointer in it.
+//! A cache folder and the generation pointer in it. Cells with shards that could not be fetched or opened cost that
+//! cell only.
 
+use std::collections::BTreeSet;
+use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
-use slag_common::manifest::{self, Manifest};
+use slag_common::manifest::{self, CellRecord, Manifest};
 use slag_common::shard::Profile;
 
-use super::bad_cell::{BadCell, OldShard};
 use super::error::StoreError;
 use super::files::{DiskFiles, Files, Stat};
 
@@ -55,6 +58,87 @@ pub struct CurrentCell {
     /// BLAKE3 of its shard.
     pub hash: Hash32,
     pub len_bytes: u64,
+}
+
+/// Why a cell's shard is not on board.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum CellFault {
+    /// The store does not have it.
+    Missing,
+    /// The store's bytes have another hash or length than the manifest lists.
+    Damaged,
+    /// It has its hash, but is not the shard that the manifest describes.
+    Invalid,
+    /// Its file on board is missing, damaged or cannot be read.
+    Unreadable,
+}
+
+/// A cell whose shard does not answer, although it is within the radius.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct BadCell {
+    /// The cell.
+    pub cell_id: u32,
+    /// The fault of its shard.
+    pub fault: CellFault,
+    /// Its shard of an earlier generation, which answers in its place.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub old: Option<OldShard>,
+}
+
+impl fmt::Display for BadCell {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { cell_id, fault, old } = self;
+        let fault = match fault {
+            CellFault::Missing => "missing",
+            CellFault::Damaged => "damaged",
+            CellFault::Invalid => "invalid",
+            CellFault::Unreadable => "unreadable on board",
+        };
+        write!(f, "{cell_id} ({fault}")?;
+        match old {
+            Some(old) => write!(f, ", generation {} answers)", old.generation),
+            None => f.write_str(")"),
+        }
+    }
+}
+
+/// A shard of an earlier generation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct OldShard {
+    /// The generation.
+    pub generation: u64,
+    /// BLAKE3 of its manifest, which is kept on board.
+    pub manifest_hash: Hash32,
+    /// BLAKE3 of the shard.
+    pub hash: Hash32,
+    /// Length of the shard.
+    pub len_bytes: u64,
+}
+
+impl OldShard {
+    pub(crate) fn of_cell(self, cell_id: u32) -> CurrentCell {
+        CurrentCell { cell_id, hash: self.hash, len_bytes: self.len_bytes }
+    }
+}
+
+pub fn cell_of(manifest: &Manifest, cell_id: u32) -> Option<&CellRecord> {
+    let position = manifest.cells.partition_point(|cell| cell.cell_id < cell_id);
+    manifest.cells.get(position).filter(|cell| cell.cell_id == cell_id)
+}
+
+/// Returns whether an earlier generation's shard of a cell may be used with a new generation: both describe the same
+/// Gaussians, in the same frame and embedding space.
+pub fn can_stand_in(old: &Manifest, new: &Manifest, cell_id: u32) -> bool {
+    let is_same_scene = old.scene == new.scene
+        && (old.encoder.id, old.encoder.dim) == (new.encoder.id, new.encoder.dim)
+        && (old.metric, old.geo_reference) == (new.metric, new.geo_reference);
+    let same_cell = |(old, new): (&CellRecord, &CellRecord)| {
+        old.bounds == new.bounds && old.n_gaussians == new.n_gaussians
+    };
+    is_same_scene && cell_of(old, cell_id).zip(cell_of(new, cell_id)).is_some_and(same_cell)
 }
 
 #[derive(Clone)]
@@ -102,10 +186,6 @@ impl EdgeCache {
         self.dir.join("shards").join(hash.to_string())
     }
 
-    pub(super) fn damaged_dir(&self) -> PathBuf {
-        self.dir.join("damaged")
-    }
-
     pub fn manifest_path(&self, hash: Hash32) -> PathBuf {
         self.dir.join("manifests").join(hash.to_string())
     }
@@ -143,12 +223,33 @@ impl EdgeCache {
 
     pub fn read_manifest(&self, hash: Hash32) -> Result<Manifest, StoreError> {
         let path = self.manifest_path(hash);
-        let missing = StoreError::missing(&path);
-        let bytes = self.files.read(&path, manifest::MAX_BYTES).map_err(missing)?;
-        let found = Hash32::of(&bytes);
-        if found != hash {
-            return Err(StoreError::Hash { path, expected: hash, found });
-        }
+        let bytes = self.files.read(&path, manifest::MAX_BYTES).map_err(StoreError::missing(&path))?;
+        StoreError::check_hash(&path, hash, &bytes)?;
         Manifest::parse(&bytes).map_err(|source| StoreError::Manifest { path, source })
+    }
+
+    fn damaged_dir(&self) -> PathBuf {
+        self.dir.join("damaged")
+    }
+
+    /// Marks a shard that was found damaged, `damaged/HASH` (empty), as readers hold no lock. It is not opened any
+    /// more, and the next fetch replaces it unread: mapping an unreadable sector ends the program. Without the mark it
+    /// is found within a day.
+    pub(crate) fn mark_damaged(&self, hash: Hash32) {
+        let path = self.damaged_dir().join(hash.to_string());
+        let made = self.create_dir(&self.damaged_dir());
+        if let Err(e) = made.and_then(|()| self.files.write_from(&path, 0, &[])) {
+            tracing::warn!("a damaged shard is not marked, so that it is downloaded again later: {e}");
+        }
+    }
+
+    pub(crate) fn marked_as_damaged(&self) -> BTreeSet<Hash32> {
+        let names = self.files.list(&self.damaged_dir()).unwrap_or_default();
+        names.iter().filter_map(|name| name.parse().ok()).collect()
+    }
+
+    /// Removes marks of shards that were replaced or are no longer on board.
+    pub(crate) fn unmark<'a>(&self, mut hashes: impl Iterator<Item = &'a Hash32>) -> io::Result<()> {
+        hashes.try_for_each(|hash| self.files.remove(&self.damaged_dir().join(hash.to_string())))
     }
 }

@@ -24,16 +24,14 @@ pub enum StoreError {
     Missing { path: PathBuf },
     #[error("{path} was found damaged; fetch again, which replaces it", path = path.display())]
     Damaged { path: PathBuf },
-    #[error("{path}: content has hash {found}, expected {expected}; fetch again, which replaces it", path = path.display())]
-    Hash { path: PathBuf, expected: Hash32, found: Hash32 },
     #[error("{path}", path = path.display())]
     Manifest { path: PathBuf, source: ManifestError },
     #[error("{path}", path = path.display())]
     Shard { path: PathBuf, source: ContainerError },
     #[error("{path}: the manifest lists no {profile} shard of cell {cell_id}; fetch again", path = path.display())]
     Unlisted { path: PathBuf, cell_id: u32, profile: Profile },
-    #[error("{path}: {field} is {found}, the manifest says {expected}; fetch again, which replaces it", path = path.display())]
-    Mismatch { path: PathBuf, field: &'static str, expected: String, found: String },
+    #[error("{path}: {what}; fetch again, which replaces it", path = path.display())]
+    Wrong { path: PathBuf, what: String },
 }
 
 impl From<io::Error> for StoreError {
@@ -45,6 +43,17 @@ impl From<io::Error> for StoreError {
 }
 
 impl StoreError {
+    /// Checks that bytes are those of a file named by their hash.
+    pub(crate) fn check_hash(path: &Path, expected: Hash32, bytes: &[u8]) -> Result<(), Self> {
+        match Hash32::of(bytes) {
+            found if found == expected => Ok(()),
+            found => {
+                let what = format!("content has hash {found}, expected {expected}");
+                Err(Self::Wrong { path: path.to_owned(), what })
+            }
+        }
+    }
+
     /// Returns the error for what reading a file that must be there gave.
     pub(super) fn missing(path: &Path) -> impl Fn(io::Error) -> Self {
         move |e| match e.kind() {
@@ -54,7 +63,6 @@ impl StoreError {
     }
 
     pub(crate) fn is_damage(&self) -> bool {
-        use StoreError::{Hash, Mismatch, Shard, Unreadable};
-        matches!(self, Shard { .. } | Mismatch { .. } | Hash { .. } | Unreadable(_))
+        matches!(self, Self::Shard { .. } | Self::Wrong { .. } | Self::Unreadable(_))
     }
 }

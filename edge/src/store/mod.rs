@@ -15,9 +15,7 @@
 //!
 //! Readers need no lock: they read `current` and the files it names, and start over if a fetch replaces it meanwhile.
 
-mod bad_cell;
 mod cache;
-pub mod damaged;
 mod error;
 pub mod files;
 pub mod history;
@@ -28,10 +26,9 @@ mod shard;
 mod snapshot;
 pub mod words;
 
-pub use bad_cell::{BadCell, CellFault, OldShard, can_stand_in, cell_of};
-pub use cache::{Current, CurrentCell, EdgeCache};
+pub use cache::{BadCell, CellFault, Current, CurrentCell, EdgeCache, OldShard, can_stand_in, cell_of};
 pub use error::StoreError;
 pub use scrubber::{Scrubbed, Scrubber};
-pub use shard::{OpenShard, check_file, check_shard};
+pub use shard::{Listed, OpenShard};
 pub use snapshot::Snapshot;
 pub(crate) use snapshot::beside_queries;

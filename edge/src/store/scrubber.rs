@@ -6,7 +6,6 @@ use std::io;
 use slag_common::Hash32;
 
 use super::cache::EdgeCache;
-use super::damaged;
 use super::snapshot::Snapshot;
 
 #[derive(Debug, Default)]
@@ -51,7 +50,7 @@ impl Scrubber {
                 let error =
                     read.err().map_or_else(|| "its bytes have another hash".to_owned(), |e| e.to_string());
                 tracing::warn!("the shard of cell {} rotted: {error}", shard.cell.cell_id);
-                damaged::mark(cache, hash);
+                cache.mark_damaged(hash);
             }
         }
         let all_bytes: u64 = snapshot.shards.iter().map(|shard| shard.len_bytes()).sum();

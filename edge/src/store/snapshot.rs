@@ -8,13 +8,11 @@ use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 use slag_common::shard::Profile;
 
-use super::bad_cell::{BadCell, CellFault, can_stand_in};
-use super::cache::{Current, CurrentCell, EdgeCache};
-use super::damaged;
+use super::cache::{BadCell, CellFault, Current, CurrentCell, EdgeCache, can_stand_in};
 use super::error::StoreError;
 use super::files::Stat;
 use super::objects::ObjectIndex;
-use super::shard::OpenShard;
+use super::shard::{Listed, OpenShard};
 
 /// Attempts of a reader while fetches replace `current`.
 const MAX_RACES: usize = 16;
@@ -73,7 +71,7 @@ impl Snapshot {
     ) -> Result<Self, StoreError> {
         let manifest = cache.read_manifest(current.manifest_hash)?;
         let held = before.map_or(&[][..], |before| &before.shards);
-        let opener = Opener { cache, profile: current.profile, marked: damaged::marked(cache), held };
+        let opener = Opener { cache, profile: current.profile, marked: cache.marked_as_damaged(), held };
         let opened: Vec<Result<Arc<OpenShard>, StoreError>> =
             beside_queries(|| current.cells.par_iter().map(|cell| opener.open(&manifest, cell)).collect());
         let (mut shards, mut failures) = (Vec::with_capacity(opened.len()), Vec::new());
@@ -96,7 +94,7 @@ impl Snapshot {
         }
         for (cell, e) in &failures {
             if e.is_damage() {
-                damaged::mark(cache, cell.hash);
+                cache.mark_damaged(cell.hash);
             }
             tracing::warn!("cell {} does not answer: {}", cell.cell_id, crate::error_line(e));
             bad_cells.push(BadCell { cell_id: cell.cell_id, fault: CellFault::Unreadable, old: None });
@@ -132,21 +130,22 @@ struct Opener<'a> {
 impl Opener<'_> {
     fn open(&self, manifest: &Manifest, cell: &CurrentCell) -> Result<Arc<OpenShard>, StoreError> {
         let Self { cache, profile, .. } = *self;
+        let listed = Listed { manifest, profile, at: cell };
         if self.marked.contains(&cell.hash) {
             return Err(StoreError::Damaged { path: cache.shard_path(cell.hash) });
         }
         let held = self.held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id);
         let held = held.ok().map(|at| &self.held[at]);
-        match held.filter(|shard| shard.is(cache, manifest, profile, cell)) {
+        match held.filter(|shard| shard.is(cache, &listed)) {
             Some(shard) => Ok(Arc::clone(shard)),
-            None => OpenShard::open(cache, manifest, profile, cell).map(Arc::new),
+            None => listed.open(cache).map(Arc::new),
         }
     }
 
     /// Opens the shard of an earlier generation that answers for a bad cell.
     fn stand_in(&self, manifest: &Manifest, bad: &BadCell) -> Option<Arc<OpenShard>> {
         let old = bad.old?;
-        let cell = CurrentCell { cell_id: bad.cell_id, hash: old.hash, len_bytes: old.len_bytes };
+        let cell = old.of_cell(bad.cell_id);
         let opened = self.cache.read_manifest(old.manifest_hash).and_then(|of_old| {
             let may_stand_in = can_stand_in(&of_old, manifest, bad.cell_id);
             may_stand_in.then(|| self.open(&of_old, &cell)).transpose()

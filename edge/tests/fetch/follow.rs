@@ -16,21 +16,16 @@ use super::{Robot, assert_holds, at, cells};
 
 const N_CELLS: usize = 30;
 
-/// Follows positions, one a second, and returns the times of fetches, seconds.
-fn drive(robot: &mut Robot, follower: &mut Follower, start: u64, xs: impl Iterator<Item = f64>) -> Vec<u64> {
-    let mut fetched_at = Vec::new();
-    for (second, x) in (start..).zip(xs) {
-        let (now, at) = (Duration::from_secs(second), DVec3::new(x, 0.0, 105.0));
-        if follower.decide(now, Some(at)) != Decision::Fetch {
-            continue;
-        }
-        robot.request.at = Some(Position::World(at));
-        robot.request.radius = follower.fetch_radius();
-        let report = robot.fetch().expect("works");
-        follower.fetched(now, report.centre_in_world);
-        fetched_at.push(second);
+/// Follows a position at a second; returns whether it fetched.
+fn drive(robot: &mut Robot, follower: &mut Follower, second: u64, x: f64) -> bool {
+    let (now, at) = (Duration::from_secs(second), DVec3::new(x, 0.0, 105.0));
+    if follower.decide(now, Some(at)) != Decision::Fetch {
+        return false;
     }
-    fetched_at
+    robot.request.at = Some(Position::World(at));
+    robot.request.radius = follower.fetch_radius();
+    follower.fetched(now, robot.fetch().expect("works").centre_in_world);
+    true
 }
 
 fn settings() -> FollowSettings {
@@ -45,10 +40,10 @@ fn going_to_and_fro_over_an_edge_costs_one_fetch() {
     // step changes the set of cells in reach.
     for edge in [100.0, 102.0] {
         let mut follower = Follower::new(settings());
-        let to_and_fro = (0..200).map(|i| edge + if i % 2 == 0 { -2.5 } else { 0.4 });
+        let x = |second: u64| edge + if second.is_multiple_of(2) { -2.5 } else { 0.4 };
         server.take_seen();
-        let fetched_at = drive(&mut robot, &mut follower, 0, to_and_fro);
-        assert_eq!(fetched_at, [0], "edge at {edge}");
+        let fetched_at = (0..200).filter(|second| drive(&mut robot, &mut follower, *second, x(*second)));
+        assert_eq!(fetched_at.collect::<Vec<_>>(), [0], "edge at {edge}");
         let seen = server.take_seen();
         let n_timestamps = seen.iter().filter(|seen| seen.path.contains("timestamp")).count();
         assert_eq!(n_timestamps, 1, "{seen:?}");
@@ -65,15 +60,10 @@ fn a_drive_always_has_what_is_around() {
     robot.request.max_bytes = Some(budget_bytes);
     let mut follower = Follower::new(settings());
     let mut n_fetches = 0;
-    for step in 0..500 {
+    for step in 0..500u32 {
         let x = 5.0 + f64::from(step) * 0.5;
         let at = DVec3::new(x, 0.0, 105.0);
-        let now = Duration::from_secs(step as u64);
-        if follower.decide(now, Some(at)) == Decision::Fetch {
-            robot.request.at = Some(Position::World(at));
-            robot.request.radius = follower.fetch_radius();
-            let report = robot.fetch().expect("works");
-            follower.fetched(now, report.centre_in_world);
+        if drive(&mut robot, &mut follower, step.into(), x) {
             n_fetches += 1;
             let on_board: u64 = robot.shards().iter().map(|hash| scene.objects[hash].len() as u64).sum();
             assert!(on_board <= budget_bytes, "{on_board}");

@@ -6,7 +6,7 @@ use slag_common::Hash32;
 use slag_common::manifest::ManifestError;
 use slag_common::shard::Profile;
 use slag_common::tuf::TufError;
-use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, PlanError, Progress};
+use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, Progress};
 use slag_edge::store::{BadCell, CellFault, Snapshot, StoreError};
 
 use super::scene::{ENCODER, FIRST, Published, ShardSpec, shard};
@@ -140,7 +140,7 @@ fn signed_nonsense_is_refused() {
     let error = fetched(scene.clone().edited(|manifest| {
         manifest.cells[1].shards = manifest.cells[0].shards.clone();
     }));
-    assert!(matches!(error, FetchError::Plan(PlanError::Conflict { .. })), "{error}");
+    assert!(error.to_string().contains("and for another cell"), "{error}");
 
     // An object that is not a shard; an empty one; one longer than any disk.
     let listing = |mut published: Published, bytes: &[u8], len_bytes: u64| {
@@ -173,8 +173,8 @@ fn addresses_that_are_none_are_refused() {
     let none =
         " store /etc/passwd file:///etc/passwd ftp://host http:// http://a@b http://a/?q=1 http://a/#f";
     for from in none.split(' ') {
-        let error = Robot::on_disk(dir.path(), from).fetch().expect_err("refused");
-        assert!(matches!(error, FetchError::Address { .. }), "{from}: {error}");
+        let error = Robot::on_disk(dir.path(), from).fetch().expect_err("refused").to_string();
+        assert!(error.contains("is not the address of a store"), "{from}: {error}");
     }
     let mut robot = Robot::on_disk(dir.path(), "http://a");
     robot.request.from = None;

@@ -79,7 +79,6 @@ fn flags_of_a_file_need_and_exclude_others() {
             "[locate]\nfocal-px = 500\nnear = '1,2,3'",
             "locate.near: needs --sigma",
         ),
-        ("slag-edge locate a.jpg --focal-px 500", &[], "sigma = 1", "edge.toml: sigma: needs --near"),
         ("slag-edge serve", &[], "[serve]\ntls-cert = 'a'", "serve.tls-cert: needs --tls-key"),
         ("slag-edge fetch", &[], "[fetch]\nat = '1,2,3'\nat-geo = '4,5'", "at-geo: cannot stand beside "),
         ("slag-edge list", &[], "[list]\nformat = 'csv'\njson = true", "cannot stand beside "),
@@ -95,6 +94,7 @@ fn flags_of_a_file_need_and_exclude_others() {
         // For all commands: only fetches accept a radius without a position.
         ("slag-edge fetch", &[], "radius = 3", "radius", &["3"]),
         ("slag-edge list", &[], "radius = 3", "radius", &[]),
+        ("slag-edge locate a.jpg --focal-px 500", &[], "sigma = 1", "sigma", &[]),
         ("slag-edge list --near 1,2,3 --radius 4", &[], "radius = 3", "radius", &["4"]),
         // A flag switched off on the line does not hide later ones.
         (

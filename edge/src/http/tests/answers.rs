@@ -41,10 +41,9 @@ async fn long_answers_come_in_small_pieces() {
     for (at, answer) in answers.iter().enumerate() {
         // The scores tie in each cell; the nearest to the origin come first.
         let (cell, index) = if at < 40_000 { (5, at) } else { (9, at - 40_000) };
-        assert_eq!(
-            (&answer["rank"], &answer["cell_id"], &answer["index"]),
-            (&(at + 1).into(), &cell.into(), &index.into())
-        );
+        assert_eq!(answer["rank"], (at + 1));
+        assert_eq!(answer["cell_id"], cell);
+        assert_eq!(answer["index"], index);
     }
     assert_eq!(answers[40_000]["position_in_world"], json!([9000.0, 0.0, 0.0]));
     assert_eq!(service.app.permits.available_permits(), service.app.settings.max_queries);

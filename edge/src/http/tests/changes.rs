@@ -57,10 +57,9 @@ async fn generations_are_compared_over_http() {
     let record = remember(service.app.engine.cache());
     let read = history::Record::parse(&record.to_bytes()).expect("what it wrote");
     for (read, written) in read.things.iter().zip(&record.things) {
-        assert_eq!(
-            (read.id, &read.photo, read.box_in_world),
-            (written.id, &written.photo, written.box_in_world)
-        );
+        assert_eq!(read.id, written.id);
+        assert_eq!(read.photo, written.photo);
+        assert_eq!(read.box_in_world, written.box_in_world);
         assert!(read.vector.iter().zip(&written.vector).all(|(a, b)| (a - b).abs() < 0.01), "{read:?}");
     }
     // The first generation has none before it, not even where one is named.
@@ -87,10 +86,8 @@ async fn generations_are_compared_over_http() {
     assert_eq!(ids(&body, "appeared"), ["o0000000000000021"], "{body:#}");
     assert_eq!(ids(&body, "went"), ["o0000000000000014"], "{body:#}");
     let moved = &body["moved"][0];
-    assert_eq!(
-        (&moved["from"]["id"], &moved["to"]["id"]),
-        (&json!("o000000000000000a"), &json!("o0000000000000016"))
-    );
+    assert_eq!(moved["from"]["id"], "o000000000000000a");
+    assert_eq!(moved["to"]["id"], "o0000000000000016");
     assert_eq!((&moved["distance"], &body["n_same"]), (&json!(12.0), &json!(1)), "{body:#}");
     let went = &body["went"][0];
     assert_eq!(
@@ -213,11 +210,8 @@ async fn texts_need_the_encoder_of_the_scene() {
     write_cache(service.dir.path(), &of(&[6, 10]), 2);
     service.app.reload_now();
     let (status, _, body) = service.get("/v1/changes?text=0").await;
-    assert_eq!(
-        (status, &body["type"]),
-        (StatusCode::CONFLICT, &json!("urn:slag:problem:encoder-mismatch")),
-        "{body:#}"
-    );
+    assert_eq!(status, StatusCode::CONFLICT, "{body:#}");
+    assert_eq!(body["type"], "urn:slag:problem:encoder-mismatch", "{body:#}");
     let (status, _, body) = service.get("/v1/changes").await;
     assert_eq!((status, ids(&body, "appeared")), (StatusCode::OK, vec!["o000000000000000a"]), "{body:#}");
 }

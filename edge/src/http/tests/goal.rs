@@ -60,10 +60,8 @@ async fn poses_or_reasons_are_given() {
     assert!((yaw - (0.45 - y).atan2(3.05 - x)).abs() < 0.2, "{body:#}");
     let (_, _, high) = service.get("/v1/goal?id=o0000000000000001&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &high);
-    assert_eq!(
-        (&high["none"]["kind"], high["goals"].as_array().map(Vec::len)),
-        (&json!("not-visible"), Some(0))
-    );
+    assert_eq!(high["none"]["kind"], "not-visible");
+    assert_eq!(high["goals"].as_array().map(Vec::len), Some(0));
     let (_, _, over) = service
         .get("/v1/goal?id=o0000000000000001&near=2,3,0&step_m=0.15&sensor_height_m=1.2&reach_m=1")
         .await;

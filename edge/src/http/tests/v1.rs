@@ -132,11 +132,8 @@ async fn areas_restrict_what_is_found() {
     for region in [&by_box, &by_ball, &by_polygon] {
         for text in ["0", "0 near the 1"] {
             let (status, _, body) = post(&service, &json!({"texts": [text], "region": region})).await;
-            assert_eq!(
-                (status, ids(&body["results"][0]).as_slice()),
-                (StatusCode::OK, &near.map(str::to_owned)[..]),
-                "{body}"
-            );
+            assert_eq!(status, StatusCode::OK, "{body}");
+            assert_eq!(ids(&body["results"][0]).as_slice(), &near.map(str::to_owned)[..], "{body}");
         }
     }
     let (_, _, body) = service.get("/v1/query?text=0&polygon=-1,-1,2,-1,2,2,-1,2").await;

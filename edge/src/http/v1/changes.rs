@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
-use axum::http::StatusCode;
 use schemars::JsonSchema;
 use serde::Deserialize;
 use slag_api::changes::ChangesReply;
@@ -13,7 +12,7 @@ use slag_service::problem::Problem;
 
 use crate::http::app::App;
 use crate::http::forms::BallParams;
-use crate::query::{ChangesError, ChangesRequest, MAX_TEXTS, RequestError, Words};
+use crate::query::{ChangesRequest, MAX_TEXTS, RequestError, Words};
 
 /// Which changes are asked for.
 #[derive(Deserialize, JsonSchema)]
@@ -47,20 +46,7 @@ pub async fn changes(
             Some((near, radius)) => Some((near.in_world("near", &snapshot.manifest)?, radius)),
             None => None,
         };
-        app.engine.changes(&ChangesRequest { from, to, ball, texts }, budget).map(Json).map_err(problem)
+        Ok(Json(app.engine.changes(&ChangesRequest { from, to, ball, texts }, budget)?))
     });
     answering.await
-}
-
-fn problem(error: ChangesError) -> Problem {
-    let (kind, detail) = (error.kind(), error.to_string());
-    match error {
-        ChangesError::Query(error) => error.into(),
-        ChangesError::NoSuchGeneration { .. } => {
-            Problem::new(StatusCode::NOT_FOUND, kind, "No such generation", detail)
-        }
-        ChangesError::Encoders { .. } | ChangesError::NoObjects(_) => {
-            Problem::new(StatusCode::CONFLICT, kind, "Generations do not compare", detail)
-        }
-    }
 }

@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
-use axum::http::StatusCode;
 use schemars::JsonSchema;
 use serde::Deserialize;
 use slag_api::FRAME;
@@ -13,10 +12,10 @@ use slag_api::goal::GoalReply;
 use slag_service::params::Params;
 use slag_service::problem::Problem;
 
-use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
+use crate::goal::{self, GoalRequest, GoalTarget, Robot, Stand};
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, ObjectIdText, XyzText};
-use crate::query::{OnBoard, RequestError, Words};
+use crate::query::{OnBoard, QueryError, RequestError, Words};
 use crate::score::Budget;
 
 #[derive(Deserialize, JsonSchema)]
@@ -81,7 +80,7 @@ async fn answer<T: Send + 'static>(
     app: &Arc<App>,
     place: PlaceParams,
     mut request: GoalRequest,
-    work: impl FnOnce(&OnBoard, &GoalRequest, &Budget) -> Result<T, GoalError> + Send + 'static,
+    work: impl FnOnce(&OnBoard, &GoalRequest, &Budget) -> Result<T, QueryError> + Send + 'static,
 ) -> Result<Json<T>, Problem> {
     let near = forms::point(place.near, place.near_lat_lon)?;
     request.check()?;
@@ -92,15 +91,7 @@ async fn answer<T: Send + 'static>(
             Some(near) => Some(near.in_world("near", manifest)?),
             None => app.last_position(manifest),
         };
-        work(&on_board, &request, budget).map(Json).map_err(problem)
+        Ok(Json(work(&on_board, &request, budget)?))
     });
     answering.await
-}
-
-fn problem(error: GoalError) -> Problem {
-    let kind = error.kind();
-    match error {
-        GoalError::Query(error) => error.into(),
-        error => Problem::new(StatusCode::CONFLICT, kind, "No places known", error.to_string()),
-    }
 }

@@ -98,11 +98,7 @@ fn problem(error: LocateError) -> Problem {
         LocateError::Version { .. } => {
             Problem::new(StatusCode::CONFLICT, "landmarks-version", "Landmarks do not fit", error.to_string())
         }
-        LocateError::Camera { parameter, found, expected } => {
-            RequestError::new(parameter, &found, expected).into()
-        }
-        LocateError::Photo(_) | LocateError::Blank | LocateError::TooLarge { .. } => {
-            Problem::new(StatusCode::BAD_REQUEST, "bad-photo", "Bad photo", error.to_string())
-        }
+        LocateError::Camera(error) => error.into(),
+        LocateError::Photo(what) => Problem::new(StatusCode::BAD_REQUEST, "bad-photo", "Bad photo", what),
     }
 }

@@ -170,12 +170,9 @@ impl Phrase {
 
     /// Checks every limit of a phrase, and that `between` alone has two things.
     pub fn check(&self) -> Result<(), RequestError> {
-        let refuse = |found: &str, expected: &str| Err(RequestError::new("phrases", found, expected));
         if self.is_asker() {
-            return refuse(
-                &self.thing,
-                "a thing to look for; the asker can only be what it is compared with",
-            );
+            let expected = "a thing to look for; the asker can only be what it is compared with";
+            return refuse(&self.thing, expected);
         }
         if self.n_things() > MAX_THINGS {
             return refuse(&format!("{} things", self.n_things()), &format!("at most {MAX_THINGS}"));
@@ -184,12 +181,9 @@ impl Phrase {
     }
 
     fn check_parts(&self) -> Result<(), RequestError> {
-        let refuse = |found: &str, expected: &str| Err(RequestError::new("phrases", found, expected));
         let is_text = |c: char| !c.is_control() || c.is_whitespace();
-        if self.thing.trim().is_empty()
-            || self.thing.len() > MAX_TEXT_BYTES
-            || !self.thing.chars().all(is_text)
-        {
+        let is_short = (1..=MAX_TEXT_BYTES).contains(&self.thing.len()) && !self.thing.trim().is_empty();
+        if !is_short || !self.thing.chars().all(is_text) {
             return refuse(&self.thing, &format!("a thing in 1 to {MAX_TEXT_BYTES} bytes of words"));
         }
         if self.is_asker() && (self.relation.is_some() || self.pick.is_some()) {
@@ -210,4 +204,8 @@ impl Phrase {
         }
         self.inner().try_for_each(Phrase::check_parts)
     }
+}
+
+fn refuse(found: &str, expected: &str) -> Result<(), RequestError> {
+    Err(RequestError::new("phrases", found, expected))
 }
