@@ -23,16 +23,21 @@ const MAX_SPREAD: f64 = 0.6;
 const MIN_OPACITY: f32 = 0.3;
 /// The median height must lie this far below the middle, relative to the height, to tell up from down.
 const MIN_SKEW: f64 = 0.03;
+/// Distance of a sky's Gaussians from the middle, relative to that of nine tenths. Uniform scenes end at 1.1 times it.
+const FAR: f64 = 4.0;
 /// Trimmed share at either end of an extent.
 pub(crate) const TRIMMED: f64 = 0.02;
 /// Default without evidence: cameras of photos have y down, and so have most files.
 pub(crate) const OF_FILES: DVec3 = DVec3::NEG_Y;
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// How an upward direction is known, best first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Sign {
     Known,
-    /// The axis may point down.
+    /// Surfaces lie across the axis, which may point down.
     Unknown,
+    /// The scene is flat across the axis, which may point down; of a thing by itself that says nothing.
+    OfSpread,
     Assumed,
 }
 
@@ -46,29 +51,46 @@ pub(crate) struct Up {
 /// Finds the vertical: the direction of most normals; of several, such as walls and floors, the one of least extent.
 /// Without any, the axis of least spread; without that, the files' own.
 pub(crate) fn find(scene: &Gaussians) -> Up {
-    let normals = normals(scene);
+    let solid = &solid(scene);
+    let normals = normals(scene, solid);
     let total: f64 = normals.iter().map(|(_, weight)| weight).sum();
     let peaks = if total > 0.0 { peaks(&normals, total) } else { Vec::new() };
     let best = peaks.first().map_or(0.0, |peak| peak.1);
     let is_rival = |peak: &&(DVec3, f64)| peak.1 >= RIVAL * best && best >= MIN_SUPPORT;
-    let height = |axis: &DVec3| extent(scene, *axis).map_or(f64::MAX, |(low, high)| high - low);
+    let height = |axis: &DVec3| extent(scene, solid, *axis).map_or(f64::MAX, |(low, high)| high - low);
     let vertical = peaks.iter().filter(is_rival).map(|(axis, _)| *axis);
     let of_normals = vertical.min_by(|a, b| height(a).total_cmp(&height(b)));
-    match (of_normals, least_spread(scene)) {
-        (Some(axis), _) => with_sign(scene, axis),
-        (None, Some(axis)) => Up { axis, sign: Sign::Unknown },
+    match (of_normals, least_spread(scene, solid)) {
+        (Some(axis), _) => with_sign(scene, solid, axis),
+        (None, Some(axis)) => Up { axis, sign: Sign::OfSpread },
         (None, None) => Up { axis: OF_FILES, sign: Sign::Assumed },
     }
 }
 
-pub(crate) fn solid(scene: &Gaussians) -> impl Iterator<Item = usize> {
-    (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY)
+/// Gaussians of surfaces, without those of a sky: far beyond nine tenths of the others, where no drawing shows detail.
+pub(crate) fn solid(scene: &Gaussians) -> Vec<u32> {
+    let mut solid: Vec<u32> =
+        (0..scene.len() as u32).filter(|i| scene.opacities[*i as usize] >= MIN_OPACITY).collect();
+    let place = |i: &u32| scene.means_in_world[*i as usize];
+    let centre = DVec3::from([0, 1, 2].map(|axis| {
+        let mut along: Vec<f64> = solid.iter().map(|i| place(i)[axis]).collect();
+        median(&mut along).unwrap_or(0.0)
+    }));
+    let mut distances: Vec<f64> = solid.iter().map(|i| place(i).distance(centre)).collect();
+    if !distances.is_empty() {
+        let nth = distances.len() * 9 / 10;
+        let (_, most, _) = distances.select_nth_unstable_by(nth, f64::total_cmp);
+        let far = FAR * *most;
+        solid.retain(|i| place(i).distance(centre) <= far);
+    }
+    solid
 }
 
 /// Normals of flat Gaussians, with weights that the largest do not dominate.
-fn normals(scene: &Gaussians) -> Vec<(DVec3, f64)> {
+fn normals(scene: &Gaussians, solid: &[u32]) -> Vec<(DVec3, f64)> {
     let stride = scene.len().div_ceil(MAX_NORMALS).max(1);
-    let flat = solid(scene).step_by(stride).filter_map(|i| {
+    let flat = solid.iter().step_by(stride).filter_map(|i| {
+        let i = *i as usize;
         let scales = scene.scales[i].map(f64::from);
         let mut axes = [0, 1, 2];
         axes.sort_by(|a, b| scales[*a].total_cmp(&scales[*b]));
@@ -120,15 +142,15 @@ fn refined(normals: &[(DVec3, f64)], axis: DVec3) -> DVec3 {
 }
 
 /// Axis of least spread, if it is clearly least.
-fn least_spread(scene: &Gaussians) -> Option<DVec3> {
-    let n = scene.len().max(1) as f64;
-    let mean = scene.means_in_world.iter().sum::<DVec3>() / n;
-    // Far Gaussians, as in a sky, count as one at the edge.
-    let mut distances: Vec<f64> = scene.means_in_world.iter().map(|at| at.distance(mean)).collect();
+fn least_spread(scene: &Gaussians, solid: &[u32]) -> Option<DVec3> {
+    let places = || solid.iter().map(|i| scene.means_in_world[*i as usize]);
+    let mean = places().sum::<DVec3>() / solid.len().max(1) as f64;
+    // Far Gaussians count as one at the edge.
+    let mut distances: Vec<f64> = places().map(|at| at.distance(mean)).collect();
     let edge = 2.0 * median(&mut distances)?;
     let mut covariance = DMat3::ZERO;
-    for at in &scene.means_in_world {
-        let offset = (*at - mean).clamp_length_max(edge);
+    for at in places() {
+        let offset = (at - mean).clamp_length_max(edge);
         covariance += DMat3::from_cols(offset * offset.x, offset * offset.y, offset * offset.z);
     }
     let (values, vectors) = eigen_symmetric(covariance.to_cols_array().to_vec(), 3);
@@ -136,20 +158,20 @@ fn least_spread(scene: &Gaussians) -> Option<DVec3> {
     (values[2].max(0.0).sqrt() < MAX_SPREAD * values[1].max(0.0).sqrt()).then_some(axis)
 }
 
-/// Positions of solid Gaussians along an axis.
-fn along(scene: &Gaussians, axis: DVec3) -> Vec<f64> {
-    solid(scene).map(|i| scene.means_in_world[i].dot(axis)).collect()
+/// Positions of some Gaussians along an axis.
+fn along(scene: &Gaussians, solid: &[u32], axis: DVec3) -> Vec<f64> {
+    solid.iter().map(|i| scene.means_in_world[*i as usize].dot(axis)).collect()
 }
 
-/// Range of solid Gaussians along an axis, without strays.
-pub(crate) fn extent(scene: &Gaussians, axis: DVec3) -> Option<(f64, f64)> {
-    trimmed_range(&mut along(scene, axis), TRIMMED)
+/// Range of some Gaussians along an axis, without strays.
+pub(crate) fn extent(scene: &Gaussians, solid: &[u32], axis: DVec3) -> Option<(f64, f64)> {
+    trimmed_range(&mut along(scene, solid, axis), TRIMMED)
 }
 
 /// Points an axis upward: things stand on the ground, so most of a scene lies in the lower half of its height.
-fn with_sign(scene: &Gaussians, axis: DVec3) -> Up {
-    let middle = median(&mut along(scene, axis));
-    let (Some((low, high)), Some(middle)) = (extent(scene, axis), middle) else {
+fn with_sign(scene: &Gaussians, solid: &[u32], axis: DVec3) -> Up {
+    let middle = median(&mut along(scene, solid, axis));
+    let (Some((low, high)), Some(middle)) = (extent(scene, solid, axis), middle) else {
         return Up { axis, sign: Sign::Unknown };
     };
     let skew = (0.5 * (low + high) - middle) / (high - low).max(f64::MIN_POSITIVE);

@@ -42,7 +42,7 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize, grown: f32) -> Result<Ga
         thin.opacities.push(scene.opacities[i]);
         thin.sh_dc.push([0.0; 3]);
     }
-    let n_solid = up::solid(&thin).count();
+    let n_solid = up::solid(&thin).len();
     if n_solid < MIN_GAUSSIANS {
         return Err(ViewpointError::Refused(format!(
             "no views can be planned: {n_solid} Gaussians are opaque and finite, expected at least {MIN_GAUSSIANS}; give photos \
@@ -55,9 +55,10 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize, grown: f32) -> Result<Ga
 impl Space {
     /// Converts a scene, enlarged by a factor, to the planner's axes, and finds its occupied voxels.
     pub(super) fn new(world: &Gaussians, grown: f32, up: DVec3) -> Self {
-        let x_axis = longest_side(world, up);
+        let solid = up::solid(world);
+        let x_axis = longest_side(world, &solid, up);
         let axes = [x_axis, up.cross(x_axis), up];
-        let ranges = axes.map(|axis| up::extent(world, axis).unwrap_or_default());
+        let ranges = axes.map(|axis| up::extent(world, &solid, axis).unwrap_or_default());
         let size = DVec3::from_array(ranges.map(|(low, high)| high - low));
         let middle = DVec3::from_array(ranges.map(|(low, high)| 0.5 * (low + high)));
         let world_from_plan = DMat3::from_cols(axes[0], axes[1], axes[2]);
@@ -82,7 +83,7 @@ impl Space {
         let occupied = Vec::new();
         let mut space =
             Self { scene, grown, half, plan_from_world, centre_in_world: centre, scale, n, occupied };
-        space.occupied = space.occupied();
+        space.occupied = space.occupied(&solid);
         space
     }
 
@@ -97,10 +98,10 @@ impl Space {
         DAffine3 { matrix3: rotation, translation: -(rotation * eye) }
     }
 
-    fn occupied(&self) -> Vec<bool> {
+    fn occupied(&self, solid: &[u32]) -> Vec<bool> {
         let mut occupied = vec![false; self.n.iter().product()];
         let scene = &self.scene;
-        for i in up::solid(scene) {
+        for i in solid.iter().map(|i| *i as usize) {
             if scene.scales[i].into_iter().any(|scale| scale > MAX_SCALE) {
                 continue;
             }
@@ -166,12 +167,12 @@ impl Space {
 }
 
 /// Horizontal direction of largest extent, with a sign that the Gaussians decide.
-fn longest_side(scene: &Gaussians, up: DVec3) -> DVec3 {
+fn longest_side(scene: &Gaussians, solid: &[u32], up: DVec3) -> DVec3 {
     let a = up.any_orthonormal_vector();
     let b = up.cross(a);
-    let solid = || up::solid(scene).map(|i| scene.means_in_world[i]);
+    let places = || solid.iter().map(|i| scene.means_in_world[*i as usize]);
     let along = |axis: DVec3| {
-        let mut values: Vec<f64> = solid().map(|at| at.dot(axis)).collect();
+        let mut values: Vec<f64> = places().map(|at| at.dot(axis)).collect();
         let median = slag_math::stats::median(&mut values).unwrap_or(0.0);
         let (low, high) = slag_math::stats::trimmed_range(&mut values, TRIMMED).unwrap_or_default();
         (median, low, high)
@@ -180,7 +181,7 @@ fn longest_side(scene: &Gaussians, up: DVec3) -> DVec3 {
     let (middle_b, ..) = along(b);
     let edge = high - low;
     let mut c = [0.0; 4];
-    for at in solid() {
+    for at in places() {
         // Far Gaussians count as those at the edge.
         let [u, v] = [at.dot(a) - middle_a, at.dot(b) - middle_b].map(|d| d.clamp(-edge, edge));
         c = [c[0] + u * u, c[1] + u * v, c[2] + u * v, c[3] + v * v];
