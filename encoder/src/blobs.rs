@@ -23,7 +23,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const RETRY_PAUSE: Duration = Duration::from_millis(300);
 
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum BlobError {
+pub enum BlobError {
     /// A message that says what to do.
     #[error("{0}")]
     Failed(String),

@@ -11,7 +11,7 @@ use slag_common::objects::object_score;
 use slag_common::shard::Profile;
 use slag_common::splat::ply::{Point, PointProperties};
 
-use crate::lift::field::{ReadFieldError, read_field, read_regions};
+use crate::lift::field::{read_field, read_regions};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader, StoredShard};
 use slag_math::dot;
@@ -27,33 +27,7 @@ pub struct Scores {
     pub total_weights: Vec<f32>,
 }
 
-#[derive(Debug, thiserror::Error)]
-pub enum QueryError {
-    #[error(transparent)]
-    Field(#[from] ReadFieldError),
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    #[error(
-        "the query has {found} components, the store's embeddings {expected}; use the models it was encoded with ({encoder})"
-    )]
-    Dimension { expected: usize, found: usize, encoder: String },
-    #[error("cell {cell_id}: Gaussian {index} of a scene of {n}; the store is damaged, encode again")]
-    Index { cell_id: u32, index: u32, n: usize },
-    #[error("cell {cell_id} has no {profile} shard; encode again with {} in --profiles", with_exact(*profile))]
-    NoShard { cell_id: u32, profile: Profile },
-    #[error("the store has no objects; encode again, without --no-objects")]
-    NoObjects,
-}
-
-/// The profiles that a command needs beside any others: exact shards tell which Gaussian is which.
-fn with_exact(profile: Profile) -> String {
-    match profile {
-        Profile::Exact => "exact".into(),
-        other => format!("{other} and exact"),
-    }
-}
-
-pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError> {
+pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, StoreError> {
     check_dim(reader, query)?;
     let table = read_regions(reader)?;
     let region_scores = table.scores(query);
@@ -75,26 +49,35 @@ impl Scores {
         Self { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] }
     }
 
-    fn set(&mut self, cell_id: u32, index: u32, cosine: f32, total_weight: f32) -> Result<(), QueryError> {
+    fn set(&mut self, cell_id: u32, index: u32, cosine: f32, total_weight: f32) -> Result<(), StoreError> {
         let (at, n) = (index as usize, self.cosines.len());
-        *self.cosines.get_mut(at).ok_or(QueryError::Index { cell_id, index, n })? = cosine;
+        *self.cosines.get_mut(at).ok_or_else(|| no_gaussian(cell_id, index, n))? = cosine;
         self.total_weights[at] = total_weight;
         Ok(())
     }
 }
 
-fn check_dim(reader: &StoreReader, query: &[f32]) -> Result<(), QueryError> {
+fn no_gaussian(cell_id: u32, index: u32, n: usize) -> StoreError {
+    StoreError::Failed(format!(
+        "cell {cell_id}: Gaussian {index} of a scene of {n}; the store is damaged, encode again"
+    ))
+}
+
+fn check_dim(reader: &StoreReader, query: &[f32]) -> Result<(), StoreError> {
     let encoder = &reader.manifest().encoder;
     let (expected, found) = (encoder.dim as usize, query.len());
     match found == expected {
         true => Ok(()),
-        false => Err(QueryError::Dimension { expected, found, encoder: encoder.name.clone() }),
+        false => Err(StoreError::Failed(format!(
+            "the query has {found} components, the store's embeddings {expected}; use the models it was encoded with ({})",
+            encoder.name
+        ))),
     }
 }
 
 /// Scores every Gaussian as decoded from a profile's shards, as on a robot that holds them. Total weights are zero:
 /// shards do not keep them.
-pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -> Result<Scores, QueryError> {
+pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -> Result<Scores, StoreError> {
     check_dim(reader, query)?;
     let mut scores = Scores::unknown(reader);
     for cell in &reader.manifest().cells {
@@ -109,16 +92,23 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
         let indexed = exact.as_ref().map_or(shard, StoredShard::view);
         for (at, cosine) in shard.scores(query).into_iter().enumerate() {
             let index = indexed.input_index(at);
-            let index = index.ok_or(QueryError::NoShard { cell_id, profile: Profile::Exact })?;
+            let index = index.ok_or_else(|| no_shard(cell_id, Profile::Exact))?;
             scores.set(cell_id, index, cosine as f32, 0.0)?;
         }
     }
     Ok(scores)
 }
 
-fn shard_of(reader: &StoreReader, cell: &CellRecord, profile: Profile) -> Result<StoredShard, QueryError> {
-    let missing = QueryError::NoShard { cell_id: cell.cell_id, profile };
-    Ok(reader.read_shard(cell.shards.get(&profile).ok_or(missing)?)?)
+fn shard_of(reader: &StoreReader, cell: &CellRecord, profile: Profile) -> Result<StoredShard, StoreError> {
+    reader.read_shard(cell.shards.get(&profile).ok_or_else(|| no_shard(cell.cell_id, profile))?)
+}
+
+fn no_shard(cell_id: u32, profile: Profile) -> StoreError {
+    // Exact shards tell which Gaussian is which.
+    let needed = if profile == Profile::Exact { String::new() } else { format!("{profile} and ") };
+    StoreError::Failed(format!(
+        "cell {cell_id} has no {profile} shard; encode again with {needed}exact in --profiles"
+    ))
 }
 
 /// Share of an object's score in its Gaussians' scores. On generated scenes, up to a third changed little, and objects
@@ -146,16 +136,14 @@ pub struct PublishedObjects {
 }
 
 impl PublishedObjects {
-    /// `None` if the scene has no objects, or no exact shards to identify Gaussians by.
-    pub fn find(reader: &StoreReader) -> Result<Option<Self>, QueryError> {
-        match Self::read(reader) {
-            Err(QueryError::NoObjects | QueryError::NoShard { .. }) => Ok(None),
-            read => read.map(Some),
-        }
+    pub fn read(reader: &StoreReader) -> Result<Self, StoreError> {
+        let none = "the store has no objects, or no exact shards that tell which Gaussians they have; encode again, without \
+                    --no-objects and with exact in --profiles";
+        Self::find(reader)?.ok_or_else(|| StoreError::Failed(none.into()))
     }
 
-    /// Takes exact shards.
-    pub fn read(reader: &StoreReader) -> Result<Self, QueryError> {
+    /// `None` if the scene has no objects, or no exact shards to identify Gaussians by.
+    pub fn find(reader: &StoreReader) -> Result<Option<Self>, StoreError> {
         let manifest = reader.manifest();
         let dim = manifest.encoder.dim as usize;
         let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
@@ -164,15 +152,16 @@ impl PublishedObjects {
         let mut header = None;
         for cell in &manifest.cells {
             let cell_id = cell.cell_id;
-            let stored = shard_of(reader, cell, Profile::Exact)?;
-            let objects = stored.objects().ok_or(QueryError::NoObjects)?;
+            let Some(record) = cell.shards.get(&Profile::Exact) else { return Ok(None) };
+            let stored = reader.read_shard(record)?;
+            let Some(objects) = stored.objects() else { return Ok(None) };
             let shard = stored.view();
             let indices = shard.exact.map_or(&[][..], |exact| exact.input_indices);
             for (run, object) in objects.runs() {
                 let id = object.map(|object| objects.records[object].id);
                 for index in indices.get(run.start as usize..run.end as usize).unwrap_or_default() {
                     let found = id_of.get_mut(*index as usize);
-                    *found.ok_or(QueryError::Index { cell_id, index: *index, n })? = id;
+                    *found.ok_or_else(|| no_gaussian(cell_id, *index, n))? = id;
                 }
             }
             let n_vectors = objects.header.n_vectors as usize;
@@ -183,19 +172,19 @@ impl PublishedObjects {
             }
             header.get_or_insert(objects.header);
         }
-        let header = header.ok_or(QueryError::NoObjects)?;
+        let Some(header) = header else { return Ok(None) };
         let ids: Vec<u64> = vectors_of_id.keys().copied().collect();
         let number =
             |id: Option<u64>| id.and_then(|id| ids.binary_search(&id).ok()).map_or(NONE, |at| at as u32);
         let object_of = id_of.into_iter().map(number).collect();
-        Ok(Self {
+        Ok(Some(Self {
             object_of,
             ids,
             calibration: Calibration { score_mean: header.score_mean, score_spread: header.score_spread },
             vectors: vectors_of_id.into_values().flatten().collect(),
             n_vectors: header.n_vectors as usize,
             dim,
-        })
+        }))
     }
 
     /// Score of each object with a unit query, see [`slag_common::objects::object_score`].
@@ -223,11 +212,6 @@ pub struct Hit {
     pub position_in_world: DVec3,
 }
 
-/// The splat is not the one that the store was encoded from.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct SceneMismatch(String);
-
 impl Scores {
     /// The `n` best, by cosine, then by index.
     pub fn best(&self, n: usize) -> Vec<u32> {
@@ -249,7 +233,7 @@ impl Scores {
 
 /// Input Gaussians with their positions, in the given order. Leaves out those whose index no shard knows; a scene with
 /// exact shards or input indices has none of these.
-pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result<Vec<Hit>, QueryError> {
+pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result<Vec<Hit>, StoreError> {
     let mut positions: HashMap<u32, Option<DVec3>> = indices.iter().map(|index| (*index, None)).collect();
     if positions.is_empty() {
         return Ok(Vec::new());
@@ -270,7 +254,7 @@ pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result
     Ok(indices.iter().filter_map(hit).collect())
 }
 
-fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<StoredShard>, QueryError> {
+fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<StoredShard>, StoreError> {
     for record in Profile::ALL.iter().filter_map(|profile| cell.shards.get(profile)) {
         let shard = reader.read_shard(record)?;
         if shard.view().has_input_indices() {
@@ -281,11 +265,11 @@ fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<Store
 }
 
 /// Fails unless a store was encoded from this splat: compares its number of Gaussians, and some positions.
-pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Result<(), SceneMismatch> {
+pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Result<(), StoreError> {
     let manifest = reader.manifest();
     let expected = manifest.n_gaussians + manifest.n_rejected;
     if scene.len() as u64 != expected {
-        return Err(SceneMismatch(format!(
+        return Err(StoreError::Failed(format!(
             "the splat has {} Gaussians, the store was encoded from one of {expected}; give that splat",
             scene.len()
         )));
@@ -298,7 +282,7 @@ pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Res
         // `NaN <= x` is false: NaN matches nothing.
         let is_same = (found - *expected).abs().max_element() <= 1.01 * error + rounding;
         if !is_same {
-            return Err(SceneMismatch(format!(
+            return Err(StoreError::Failed(format!(
                 "Gaussian {index} lies at {found} in the splat, at {expected} in the store; give the splat that the store was \
                  encoded from"
             )));
@@ -350,7 +334,7 @@ mod tests {
 
     #[test]
     fn a_missing_shard_names_each_profile_once() {
-        let message = |profile| QueryError::NoShard { cell_id: 3, profile }.to_string();
+        let message = |profile| no_shard(3, profile).to_string();
         assert!(message(Profile::Exact).ends_with("with exact in --profiles"), "{}", message(Profile::Exact));
         let compact = message(Profile::Compact);
         assert!(compact.ends_with("with compact and exact in --profiles"), "{compact}");

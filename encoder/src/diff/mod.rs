@@ -36,11 +36,13 @@ pub(crate) struct Diff {
     pub(crate) fetch_bytes: BTreeMap<String, u64>,
 }
 
-pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, DiffError> {
+pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, StoreError> {
     let (old_manifest, manifest) = (&old.published.manifest, &new.published.manifest);
     if old_manifest.encoder.id != manifest.encoder.id {
         let [old, new] = [old_manifest, manifest].map(|m| format!("{} ({})", m.encoder.name, m.encoder.id));
-        return Err(DiffError::Encoders { old, new });
+        return Err(StoreError::NotComparable(format!(
+            "the generations are of different encoders, {old} and {new}; encode one of them again with the other's models"
+        )));
     }
     let ((old_things, old_places), (things, places)) = (read_things(old)?, read_things(new)?);
     let new_tells = |thing: &Thing| !is_unchanged(thing, &old_places, &places);
@@ -79,28 +81,21 @@ pub(crate) struct Generation<'a> {
     pub(crate) published: &'a Published,
 }
 
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum DiffError {
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    #[error("generation {generation} has no objects to compare; encode again, without --no-objects")]
-    NoObjects { generation: u64 },
-    #[error(
-        "the generations are of different encoders, {old} and {new}; encode one of them again with the other's models"
-    )]
-    Encoders { old: String, new: String },
-}
-
 /// Reads objects by id, and cells, from the finest shards of each.
-fn read_things(generation: Generation<'_>) -> Result<(Vec<Thing>, Vec<Place>), DiffError> {
+fn read_things(generation: Generation<'_>) -> Result<(Vec<Thing>, Vec<Place>), StoreError> {
     let manifest = &generation.published.manifest;
     let mut places = Vec::new();
     let mut things: BTreeMap<u64, Thing> = BTreeMap::new();
     for cell in &manifest.cells {
         let Some(shard) = cell.shards.values().next_back() else { continue };
         let shard = generation.reader.read_shard(shard)?;
-        let no_objects = DiffError::NoObjects { generation: manifest.generation };
-        let objects = shard.objects().ok_or(no_objects)?;
+        let no_objects = || {
+            format!(
+                "generation {} has no objects to compare; encode again, without --no-objects",
+                manifest.generation
+            )
+        };
+        let objects = shard.objects().ok_or_else(|| StoreError::NotComparable(no_objects()))?;
         Thing::add_all(&mut things, &shard.view(), &objects);
         places.push(Place { bounds: cell.bounds, splat: shard.view().splat_digest() });
     }

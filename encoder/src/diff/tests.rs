@@ -61,7 +61,7 @@ fn publish(
     store.publish(&manifest, &Extras::new()).expect("publishes");
 }
 
-fn compare(reader: &StoreReader) -> Result<Diff, DiffError> {
+fn compare(reader: &StoreReader) -> Result<Diff, StoreError> {
     let old = reader.previous().expect("two generations");
     diff(Generation { reader, published: old }, Generation { reader, published: reader.current() })
 }
@@ -149,13 +149,13 @@ fn what_does_not_compare_is_refused() {
     publish(&store, 3, &[&[(Profile::Compact, without_objects())]], |_| {});
     publish(&store, 4, &[cell], |_| {});
     let refused = compare(&store.reader().expect("published")).expect_err("no objects");
-    assert!(matches!(refused, DiffError::NoObjects { generation: 3 }), "{refused}");
+    assert!(refused.to_string().starts_with("generation 3 has no objects"), "{refused}");
     let dir = tempfile::tempdir().expect("a folder");
     let store = Store::create_or_open(dir.path()).expect("opens");
     publish(&store, 1, &[cell], |_| {});
     publish(&store, 2, &[cell, &[(Profile::Compact, b"no shard".to_vec())]], |_| {});
     let refused = compare(&store.reader().expect("published")).expect_err("damaged");
-    assert!(matches!(refused, DiffError::Store(StoreError::Shard { .. })), "{refused}");
+    assert!(matches!(refused, StoreError::Shard { .. }), "{refused}");
 }
 
 fn without_objects() -> Vec<u8> {

@@ -14,7 +14,7 @@ use crate::memory::MemoryError;
 use crate::raster::RasterError;
 use crate::segment::SegmentError;
 use crate::store::{StoreError, io_help, records_help};
-use crate::viewpoints::{DrawError, ViewpointError};
+use crate::viewpoints::ViewpointError;
 
 #[derive(Debug, thiserror::Error)]
 pub enum EncodeError {
@@ -30,8 +30,6 @@ pub enum EncodeError {
     Geo(#[from] GeoError),
     #[error(transparent)]
     Viewpoints(#[from] ViewpointError),
-    #[error(transparent)]
-    Draw(#[from] DrawError),
     #[error(transparent)]
     Ingest(#[from] IngestError),
     #[error(transparent)]
@@ -68,8 +66,9 @@ pub enum EncodeError {
     Failed(String),
     #[error(transparent)]
     Memory(#[from] MemoryError),
+    #[cfg(feature = "fleet")]
     #[error(transparent)]
-    Fleet(Box<dyn std::error::Error + Send + Sync>),
+    Blob(#[from] crate::blobs::BlobError),
     #[error("interrupted after {n_done} of {n_views} views; run the same command again to resume")]
     Interrupted { n_done: usize, n_views: usize },
 }

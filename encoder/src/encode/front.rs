@@ -4,8 +4,9 @@
 //! Gaussians. Photos of another size, other models or another machine need a front of their own.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 use slag_common::files;
 use slag_common::shard::Profile;
@@ -48,46 +49,27 @@ pub struct Expectation {
     pub bytes: f64,
 }
 
-#[derive(Debug, thiserror::Error)]
-pub enum FrontError {
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-    #[error("{}: {what}; expected front.json as `slag-lab bench tradeoff` writes it", path.display())]
-    Malformed { path: PathBuf, what: String },
-    #[error(
-        "no measured setting meets the target: the quickest, {quickest}, is expected to take {seconds:.1} s, the smallest, {smallest}, {bytes:.0} bytes; raise the target"
-    )]
-    OutOfReach { quickest: String, seconds: f64, smallest: String, bytes: f64 },
-}
-
 impl Front {
-    pub fn read(path: &Path) -> Result<Self, FrontError> {
-        Self::parse(&io::read_to_string(files::open(path)?)?, path)
+    pub fn read(path: &Path) -> Result<Self> {
+        let expected =
+            || format!("{}: expected front.json as `slag-lab bench tradeoff` writes it", path.display());
+        Self::parse(&io::read_to_string(files::open(path)?)?).with_context(expected)
     }
 
-    fn parse(text: &str, path: &Path) -> Result<Self, FrontError> {
-        let wrong = |what: String| FrontError::Malformed { path: path.to_owned(), what };
-        let front: Self = serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
-        if front.settings.is_empty() {
-            return Err(wrong("no settings".into()));
-        }
+    fn parse(text: &str) -> Result<Self> {
+        let front: Self = serde_json::from_str(text)?;
+        ensure!(!front.settings.is_empty(), "no settings");
         for setting in &front.settings {
             let costs =
                 [setting.seconds_per_view, setting.seconds_per_million_gaussians, setting.bytes_per_gaussian];
-            if !costs.iter().all(|cost| (0.0..1e12).contains(cost)) {
-                return Err(wrong(format!("{}: costs {costs:?}; expected 0 to 1e12", setting.name)));
-            }
+            let is_sound = costs.iter().all(|cost| (0.0..1e12).contains(cost));
+            ensure!(is_sound, "{}: costs {costs:?}; expected 0 to 1e12", setting.name);
         }
         Ok(front)
     }
 
     /// Returns the most accurate setting expected to meet the target, the quicker one of equals.
-    pub fn choose(
-        &self,
-        target: Target,
-        n_photos: usize,
-        n_gaussians: usize,
-    ) -> Result<Expectation, FrontError> {
+    pub fn choose(&self, target: Target, n_photos: usize, n_gaussians: usize) -> Result<Expectation> {
         let expect = |setting: &FrontSetting| Expectation {
             seconds: setting.seconds_per_view * n_photos as f64
                 + setting.seconds_per_million_gaussians * n_gaussians as f64 / 1e6,
@@ -103,18 +85,19 @@ impl Front {
             .iter()
             .filter(meets)
             .max_by(|a, b| a.setting.miou.total_cmp(&b.setting.miou).then(b.seconds.total_cmp(&a.seconds)));
-        let quickest = || all.iter().min_by(|a, b| a.seconds.total_cmp(&b.seconds));
-        let smallest = || all.iter().min_by(|a, b| a.bytes.total_cmp(&b.bytes));
-        match (best, quickest(), smallest()) {
-            (Some(best), ..) => Ok(best.clone()),
-            (None, Some(quick), Some(small)) => Err(FrontError::OutOfReach {
-                quickest: quick.setting.name.clone(),
-                seconds: quick.seconds,
-                smallest: small.setting.name.clone(),
-                bytes: small.bytes,
-            }),
-            (None, ..) => Err(FrontError::Malformed { path: "front".into(), what: "no settings".into() }),
+        if let Some(best) = best {
+            return Ok(best.clone());
         }
+        let quickest = all.iter().min_by(|a, b| a.seconds.total_cmp(&b.seconds)).context("no settings")?;
+        let smallest = all.iter().min_by(|a, b| a.bytes.total_cmp(&b.bytes)).context("no settings")?;
+        bail!(
+            "no measured setting meets the target: the quickest, {}, is expected to take {:.1} s, the smallest, {}, {:.0} \
+             bytes; raise the target",
+            quickest.setting.name,
+            quickest.seconds,
+            smallest.setting.name,
+            smallest.bytes
+        )
     }
 }
 
@@ -161,9 +144,8 @@ mod tests {
 
     #[test]
     fn fronts_are_checked() {
-        let refused =
-            |text: &str| Front::parse(text, Path::new("f.json")).expect_err("malformed").to_string();
-        assert!(refused("{}").contains("f.json"), "{}", refused("{}"));
+        let refused = |text: &str| Front::parse(text).expect_err("malformed").to_string();
+        assert!(refused("{}").contains("missing field"), "{}", refused("{}"));
         let empty = r#"{"machine": "", "measured_with": "", "n_scenes": 1, "settings": []}"#;
         assert!(refused(empty).contains("no settings"));
         let wrong = setting("wrong", -1.0, 5.0, 0.5);
@@ -173,6 +155,6 @@ mod tests {
         assert!(refused(&text).contains("expected 0 to"), "{}", refused(&text));
         front.settings[0].seconds_per_view = 1.0;
         let text = serde_json::to_string(&front).expect("JSON");
-        assert_eq!(Front::parse(&text, Path::new("f.json")).expect("well-formed"), front);
+        assert_eq!(Front::parse(&text).expect("well-formed"), front);
     }
 }

@@ -12,7 +12,7 @@ use super::heartbeat::Heartbeat;
 use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
-use super::{FleetError, objects, prepared};
+use super::{damaged, objects, prepared};
 use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, ViewRecord, ViewsRun};
 use crate::encode::{EncodeError, Engines, SkippedView};
@@ -34,7 +34,7 @@ impl Coordinator {
         &self,
         plan: &Plan<'_>,
         done: &BTreeMap<String, ViewRecord>,
-    ) -> Result<ViewsInWork<'_>, FleetError> {
+    ) -> Result<ViewsInWork<'_>, EncodeError> {
         let is_open = |view: &usize| !done.contains_key(&plan.inputs.views[*view].name);
         let open: Vec<usize> = plan.order.iter().copied().filter(is_open).collect();
         let run_plan = prepared::upload(&self.bucket, plan, &open)?;
@@ -81,7 +81,7 @@ impl Executor for Coordinator {
 
     fn begin_publication(&self) -> Result<(), EncodeError> {
         match &*self.run.lock().unwrap_or_else(PoisonError::into_inner) {
-            Some((run, _)) => Ok(run.publish(&self.bucket)?),
+            Some((run, _)) => run.publish(&self.bucket),
             None => Ok(()),
         }
     }
@@ -99,7 +99,7 @@ struct ViewsInWork<'a> {
 
 impl ViewsInWork<'_> {
     /// Downloads finished views into this machine's job; returns their number.
-    fn fetch_done(&mut self, plan: &Plan<'_>) -> Result<usize, FleetError> {
+    fn fetch_done(&mut self, plan: &Plan<'_>) -> Result<usize, EncodeError> {
         let names = self.bucket.list("views")?;
         let there: BTreeSet<Hash32> = names.iter().filter_map(|name| name.parse().ok()).collect();
         let fresh: Vec<(&Hash32, &(usize, String))> =
@@ -107,7 +107,7 @@ impl ViewsInWork<'_> {
         let fetch = |(id, (_, name)): &(&Hash32, &(usize, String))| {
             self.fetch_view(plan, **id, name)?;
             plan.context.progress.advance(1);
-            Ok::<_, FleetError>(())
+            Ok::<_, EncodeError>(())
         };
         plan.context.install(|| fresh.par_iter().try_for_each(fetch))?;
         let n_fresh = fresh.len();
@@ -115,18 +115,18 @@ impl ViewsInWork<'_> {
         Ok(n_fresh)
     }
 
-    fn fetch_view(&self, plan: &Plan<'_>, id: Hash32, name: &str) -> Result<(), FleetError> {
+    fn fetch_view(&self, plan: &Plan<'_>, id: Hash32, name: &str) -> Result<(), EncodeError> {
         let key = documents::view_key(id);
         let bytes = self.bucket.require(&key)?;
         let (record, outlines, contributions) =
-            objects::unpack_view(&bytes).map_err(|e| FleetError::damaged(self.bucket, &key, e))?;
+            objects::unpack_view(&bytes).map_err(|e| damaged(self.bucket, &key, e))?;
         durable::write(&plan.job.outlines_path(name), &outlines)?;
         durable::write(&plan.job.contributions_path(name), &contributions)?;
         Ok(plan.job.mark_done(name, record)?)
     }
 
     /// Leaves out views that workers could not do; with `is_strict`, fails at the first.
-    fn take_failed(&mut self, is_strict: bool) -> Result<(), FleetError> {
+    fn take_failed(&mut self, is_strict: bool) -> Result<(), EncodeError> {
         for name in self.bucket.list(&self.run.failed_folder())? {
             let number: Option<usize> = name.strip_suffix(".json").and_then(|number| number.parse().ok());
             let Some(id) = self.open.iter().find(|(_, (n, _))| Some(*n) == number).map(|(id, _)| *id) else {
@@ -136,14 +136,14 @@ impl ViewsInWork<'_> {
             let FailedView { reason } = documents::parse(self.bucket, &key, &self.bucket.require(&key)?)?;
             let Some((_, view)) = self.open.remove(&id) else { continue };
             if is_strict {
-                return Err(FleetError::Failed(format!("view {view}: {reason}")));
+                return Err(EncodeError::Failed(format!("view {view}: {reason}")));
             }
             self.skipped.push(view, reason);
         }
         Ok(())
     }
 
-    fn wait(&mut self) -> Result<(), FleetError> {
+    fn wait(&mut self) -> Result<(), EncodeError> {
         self.run.check(self.bucket)?;
         let mut numbers: Vec<usize> = self.open.values().map(|(number, _)| *number).collect();
         numbers.sort_unstable();
@@ -155,7 +155,7 @@ impl ViewsInWork<'_> {
     }
 
     /// Dismisses the workers; returns the left-out views.
-    fn end(self) -> Result<Vec<SkippedView>, FleetError> {
+    fn end(self) -> Result<Vec<SkippedView>, EncodeError> {
         self.run.views_are_done(self.bucket)?;
         if let Some(queue) = &self.queue {
             queue.close();

@@ -5,15 +5,15 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::FleetError;
+use crate::encode::EncodeError;
 
 /// Returns the open views' indices, in the order in which to begin them.
-pub(super) type OpenViews<'a> = &'a mut dyn FnMut() -> Result<Vec<usize>, FleetError>;
+pub(super) type OpenViews<'a> = &'a mut dyn FnMut() -> Result<Vec<usize>, EncodeError>;
 
 /// Gives a worker its views, by index in the plan.
 pub(super) trait Dispatcher: Sync {
     /// Called before views are taken, and again after [`Dispatcher::wait`].
-    fn offer(&self, open: OpenViews<'_>) -> Result<(), FleetError>;
+    fn offer(&self, open: OpenViews<'_>) -> Result<(), EncodeError>;
 
     /// The next view, without waiting; `None` if there is none at present.
     fn take(&self) -> Option<usize>;
@@ -57,7 +57,7 @@ impl Share {
 }
 
 impl Dispatcher for Share {
-    fn offer(&self, open: OpenViews<'_>) -> Result<(), FleetError> {
+    fn offer(&self, open: OpenViews<'_>) -> Result<(), EncodeError> {
         let open = open()?;
         let mut progress = self.progress();
         let is_chosen = |view: &usize| progress.helps || view % self.of == self.index;

@@ -5,10 +5,10 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use slag_common::{Hash32, Intrinsics};
 
-use super::FleetError;
+use super::damaged;
 use crate::blobs::Bucket;
 use crate::cells::CellLimits;
-use crate::encode::ViewSettings;
+use crate::encode::{EncodeError, ViewSettings};
 
 const FORMAT: u32 = 4;
 
@@ -83,10 +83,10 @@ pub(super) fn view_key(id: Hash32) -> String {
     format!("views/{id}")
 }
 
-pub(super) fn parse<T: DeserializeOwned>(bucket: &Bucket, key: &str, bytes: &[u8]) -> Result<T, FleetError> {
-    serde_json::from_slice(bytes).map_err(|e| FleetError::damaged(bucket, key, e))
+pub(super) fn parse<T: DeserializeOwned>(bucket: &Bucket, key: &str, bytes: &[u8]) -> Result<T, EncodeError> {
+    serde_json::from_slice(bytes).map_err(|e| damaged(bucket, key, e))
 }
 
-pub(super) fn to_bytes(document: &impl Serialize) -> Result<Vec<u8>, FleetError> {
+pub(super) fn to_bytes(document: &impl Serialize) -> Result<Vec<u8>, EncodeError> {
     Ok(serde_json::to_vec(document).map_err(std::io::Error::from)?)
 }

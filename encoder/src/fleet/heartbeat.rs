@@ -7,9 +7,9 @@ use std::sync::Arc;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
-use super::FleetError;
 use super::run::Run;
 use crate::blobs::Bucket;
+use crate::encode::EncodeError;
 
 /// Interval of beats, and of checks for them.
 const BEAT: Duration = Duration::from_secs(10);
@@ -55,8 +55,8 @@ impl HeartbeatWatch {
     /// Checks for a new beat, if it is time.
     ///
     /// # Errors
-    /// [`FleetError::Failed`] after too long a silence; [`FleetError::Blob`].
-    pub(super) fn check(&mut self, bucket: &Bucket) -> Result<(), FleetError> {
+    /// [`EncodeError::Failed`] after too long a silence.
+    pub(super) fn check(&mut self, bucket: &Bucket) -> Result<(), EncodeError> {
         if self.looked.is_some_and(|looked| looked.elapsed() < BEAT.min(self.patience)) {
             return Ok(());
         }
@@ -71,7 +71,7 @@ impl HeartbeatWatch {
         if silence < self.patience {
             return Ok(());
         }
-        Err(FleetError::Failed(format!(
+        Err(EncodeError::Failed(format!(
             "run {}: its coordinator has shown no heartbeat for {} s. What is done lies in {}: start the same encode again, \
              then its workers",
             self.run.0,

@@ -26,49 +26,13 @@ mod run;
 mod views;
 pub(crate) mod worker;
 
-use crate::blobs::BlobError;
+use crate::blobs::Bucket;
 use crate::encode::EncodeError;
 
 pub(crate) use coordinator::Coordinator;
 pub(crate) use queue::QueueSettings;
 pub(crate) use worker::{Dispatch, WorkerSettings, work};
 
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum FleetError {
-    #[error(transparent)]
-    Blob(#[from] BlobError),
-    #[error(transparent)]
-    Encode(#[from] EncodeError),
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-    #[error(
-        "run {run} was superseded: another `encode --blobs` uses {url}. Let one of them finish, or give the other another prefix"
-    )]
-    Superseded { run: u64, url: String },
-    /// A message that says what to do.
-    #[error("{0}")]
-    Failed(String),
-    #[error(transparent)]
-    Memory(#[from] crate::memory::MemoryError),
-}
-
-impl FleetError {
-    pub(super) fn damaged(bucket: &crate::blobs::Bucket, key: &str, problem: impl std::fmt::Display) -> Self {
-        Self::Failed(format!("{}/{key}: {problem}; delete it, and it is made again", bucket.url))
-    }
-}
-
-impl From<FleetError> for EncodeError {
-    fn from(error: FleetError) -> Self {
-        match error {
-            FleetError::Encode(error) => error,
-            error => Self::Fleet(Box::new(error)),
-        }
-    }
-}
-
-impl From<BlobError> for EncodeError {
-    fn from(error: BlobError) -> Self {
-        FleetError::from(error).into()
-    }
+fn damaged(bucket: &Bucket, key: &str, problem: impl std::fmt::Display) -> EncodeError {
+    EncodeError::Failed(format!("{}/{key}: {problem}; delete it, and it is made again", bucket.url))
 }

@@ -10,11 +10,11 @@ use slag_common::{Gaussians, Hash32, View};
 
 use super::documents::{self, InputFile, PlannedView, RunPlan};
 use super::run::Run;
-use super::{FleetError, objects};
+use super::{damaged, objects};
 use crate::blobs::Bucket;
 use crate::cells::{self, CellSplit};
 use crate::encode::fleet_parts::{OF_A_FLEET, Plan, RunContext, ViewSink, ViewTools, of_scene};
-use crate::encode::{Engines, Masks, ViewSettings};
+use crate::encode::{EncodeError, Engines, Masks, ViewSettings};
 use crate::ground::{self, Standing};
 use crate::memory::{MemoryPlan, Phase};
 use crate::segment::{self, Segmenter};
@@ -42,10 +42,10 @@ impl Prepared {
         folder: &Path,
         segmenter: Option<&PathBuf>,
         context: &RunContext<'_>,
-    ) -> Result<Self, FleetError> {
+    ) -> Result<Self, EncodeError> {
         let bytes = fetch_input(bucket, plan.scene)?;
         let key = documents::input_key(plan.scene);
-        let scene = objects::unpack_scene(&bytes).map_err(|e| FleetError::damaged(bucket, &key, e))?;
+        let scene = objects::unpack_scene(&bytes).map_err(|e| damaged(bucket, &key, e))?;
         drop(bytes);
         let split = context.install(|| cells::split(&scene, plan.limits));
         let mut settings = plan.settings.clone();
@@ -73,7 +73,7 @@ impl Prepared {
     }
 
     /// Fetches a view's photo and masks.
-    pub(super) fn fetch_view(&self, bucket: &Bucket, number: usize) -> Result<(), FleetError> {
+    pub(super) fn fetch_view(&self, bucket: &Bucket, number: usize) -> Result<(), EncodeError> {
         let planned = &self.plan.views[number];
         let mut files = vec![(&planned.photo, photo_path(planned, &self.folder))];
         files.extend(planned.masks.as_ref().zip(mask_path(planned, &self.folder)));
@@ -98,7 +98,7 @@ impl Prepared {
         engines: &Engines<'_>,
         segmenter: &dyn Segmenter,
         context: &RunContext<'_>,
-    ) -> Result<(), FleetError> {
+    ) -> Result<(), EncodeError> {
         let cells = self.split.deciding(self.plan.limits);
         let found =
             context.install(|| of_scene(&self.settings, cells, engines, segmenter, OF_A_FLEET, &self.scene));
@@ -111,7 +111,7 @@ impl Prepared {
         }
     }
 
-    pub(super) fn check_memory(&self, memory_bytes: u64, tools: &ViewTools<'_>) -> Result<(), FleetError> {
+    pub(super) fn check_memory(&self, memory_bytes: u64, tools: &ViewTools<'_>) -> Result<(), EncodeError> {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());
         CellSplit::reserve(&mut memory, self.scene.len());
@@ -132,28 +132,28 @@ fn mask_path(view: &PlannedView, folder: &Path) -> Option<PathBuf> {
 }
 
 /// The view as it is on this machine.
-fn planned_view(planned: &PlannedView, folder: &Path) -> Result<View, FleetError> {
+fn planned_view(planned: &PlannedView, folder: &Path) -> Result<View, EncodeError> {
     let PlannedView { name, intrinsics, camera_from_world, .. } = planned;
     let is_inside = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
     let mut files = planned.masks.iter().chain([&planned.photo]);
     if !is_inside || files.any(|file| file.ending.contains(['/', '\\'])) {
-        return Err(FleetError::Failed(format!("view {name}: its name leads out of the folder of photos")));
+        return Err(EncodeError::Failed(format!("view {name}: its name leads out of the folder of photos")));
     }
     let (name, image_path) = (name.clone(), photo_path(planned, folder));
     Ok(View { name, image_path, intrinsics: *intrinsics, camera_from_world: *camera_from_world })
 }
 
 /// Uploads the scene and the open views' files; returns the plan of a run. `open`: indices of views.
-pub(super) fn upload(bucket: &Bucket, plan: &Plan<'_>, open: &[usize]) -> Result<RunPlan, FleetError> {
+pub(super) fn upload(bucket: &Bucket, plan: &Plan<'_>, open: &[usize]) -> Result<RunPlan, EncodeError> {
     let there: BTreeSet<String> = bucket.list("inputs")?.into_iter().collect();
-    let put = |bytes: Vec<u8>| -> Result<Hash32, FleetError> {
+    let put = |bytes: Vec<u8>| -> Result<Hash32, EncodeError> {
         let hash = Hash32::of(&bytes);
         if !there.contains(&hash.to_string()) {
             bucket.put_new(&documents::input_key(hash), bytes)?;
         }
         Ok(hash)
     };
-    let put_file = |path: &Path| -> Result<(InputFile, u64), FleetError> {
+    let put_file = |path: &Path| -> Result<(InputFile, u64), EncodeError> {
         let bytes = fs_err::read(path)?;
         let ending = path.extension().unwrap_or_default().to_string_lossy().into_owned();
         let len = bytes.len() as u64;
@@ -165,7 +165,7 @@ pub(super) fn upload(bucket: &Bucket, plan: &Plan<'_>, open: &[usize]) -> Result
         Masks::Given { dir, .. } => (None, Some(put_file(dir)?.0)),
         Masks::Auto { .. } | Masks::Graph | Masks::Sam { .. } => (None, None),
     };
-    let planned = |number: &usize| -> Result<(u64, PlannedView), FleetError> {
+    let planned = |number: &usize| -> Result<(u64, PlannedView), EncodeError> {
         let view = &plan.inputs.views[*number];
         let masks = mask_folder.and_then(|dir| segment::mask_file(dir, view));
         let masks = masks.map(|path| put_file(&path)).transpose()?;
@@ -199,8 +199,8 @@ pub(super) fn upload(bucket: &Bucket, plan: &Plan<'_>, open: &[usize]) -> Result
     })
 }
 
-fn other_engines(run: Run, planned: &str, own: &str) -> FleetError {
-    FleetError::Failed(format!(
+fn other_engines(run: Run, planned: &str, own: &str) -> EncodeError {
+    EncodeError::Failed(format!(
         "run {} was planned with {planned}, this worker would encode with {own} and make other contributions; give the worker \
          the coordinator's --models, --segmenter, --provider and program",
         run.0
@@ -212,16 +212,16 @@ pub(super) fn engines_text(models: impl ToString, segmenter: &str) -> String {
     format!("{} and {segmenter}", models.to_string())
 }
 
-pub(super) fn fetch_input(bucket: &Bucket, hash: Hash32) -> Result<axum::body::Bytes, FleetError> {
+pub(super) fn fetch_input(bucket: &Bucket, hash: Hash32) -> Result<axum::body::Bytes, EncodeError> {
     let key = documents::input_key(hash);
     let bytes = bucket.require(&key)?;
     match Hash32::of(&bytes) {
         found if found == hash => Ok(bytes),
-        found => Err(FleetError::damaged(bucket, &key, format!("the content's hash is {found}"))),
+        found => Err(damaged(bucket, &key, format!("the content's hash is {found}"))),
     }
 }
 
-pub(super) fn fetch_file(bucket: &Bucket, file: &InputFile, path: &Path) -> Result<(), FleetError> {
+pub(super) fn fetch_file(bucket: &Bucket, file: &InputFile, path: &Path) -> Result<(), EncodeError> {
     let bytes = fetch_input(bucket, file.hash)?;
     if let Some(folder) = path.parent() {
         fs_err::create_dir_all(folder)?;

@@ -18,9 +18,9 @@ use futures_util::StreamExt;
 use slag_common::Hash32;
 use tokio::runtime::Runtime;
 
-use super::FleetError;
 use super::dispatch::{Dispatcher, OpenViews};
 use super::run::Run;
+use crate::encode::EncodeError;
 
 const CONSUMER: &str = "workers";
 /// How long a pull request waits at the server.
@@ -47,9 +47,9 @@ pub(crate) struct QueueSettings {
 }
 
 impl QueueSettings {
-    async fn connect(&self) -> Result<Context, FleetError> {
+    async fn connect(&self) -> Result<Context, EncodeError> {
         let refuse = |problem: &dyn Display| {
-            FleetError::Failed(format!(
+            EncodeError::Failed(format!(
                 "{}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials",
                 self.url
             ))
@@ -93,7 +93,7 @@ impl Enqueuer {
         settings: &QueueSettings,
         run: Run,
         of_scene: Hash32,
-    ) -> Result<Self, FleetError> {
+    ) -> Result<Self, EncodeError> {
         let context = runtime.block_on(settings.connect())?;
         Ok(Self {
             runtime: Arc::clone(runtime),
@@ -238,7 +238,7 @@ impl Queue {
         run: Run,
         of_scene: Hash32,
         n_most: usize,
-    ) -> Result<Self, FleetError> {
+    ) -> Result<Self, EncodeError> {
         let context = runtime.block_on(settings.connect())?;
         let held = Arc::new(Held {
             runtime: runtime.handle().clone(),
@@ -304,7 +304,7 @@ async fn send_heartbeats(held: Weak<Held>, interval: Duration) {
 }
 
 impl Dispatcher for Queue {
-    fn offer(&self, _open: OpenViews<'_>) -> Result<(), FleetError> {
+    fn offer(&self, _open: OpenViews<'_>) -> Result<(), EncodeError> {
         Ok(())
     }
 

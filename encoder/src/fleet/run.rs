@@ -2,9 +2,9 @@
 //! coordinator's word that it publishes, or by that of the next run's coordinator. Both put the same object on
 //! condition that it is not there, so one put decides whether a run is published.
 
-use super::FleetError;
 use super::documents::{self, End, PlannedBy, RunPlan};
 use crate::blobs::Bucket;
+use crate::encode::EncodeError;
 
 /// Keys of a run: how it ended; all its views are done.
 const END: &str = "end.json";
@@ -35,7 +35,7 @@ impl Run {
     }
 
     /// The newest run, and the names of all runs' objects.
-    fn newest(bucket: &Bucket) -> Result<Option<(Self, Vec<String>)>, FleetError> {
+    fn newest(bucket: &Bucket) -> Result<Option<(Self, Vec<String>)>, EncodeError> {
         let names = bucket.list("jobs")?;
         let number = |name: &String| name.strip_suffix("/plan.json")?.parse().ok();
         let newest = names.iter().filter_map(number).max().map(Self);
@@ -46,7 +46,7 @@ impl Run {
         names.contains(&format!("{:08}/{name}", self.0))
     }
 
-    pub(super) fn begin(bucket: &Bucket, plan: &RunPlan) -> Result<Self, FleetError> {
+    pub(super) fn begin(bucket: &Bucket, plan: &RunPlan) -> Result<Self, EncodeError> {
         let newest = Self::newest(bucket)?;
         if let Some((run, names)) = &newest
             && !run.has(names, END)
@@ -64,7 +64,7 @@ impl Run {
     }
 
     /// The newest run and its plan, unless it has ended or its views are done.
-    pub(super) fn open(bucket: &Bucket) -> Result<Option<(Self, RunPlan)>, FleetError> {
+    pub(super) fn open(bucket: &Bucket) -> Result<Option<(Self, RunPlan)>, EncodeError> {
         let Some((run, names)) = Self::newest(bucket)? else { return Ok(None) };
         if [DONE, END].iter().any(|name| run.has(&names, name)) {
             return Ok(None);
@@ -74,7 +74,7 @@ impl Run {
         let PlannedBy { program: planned } = documents::parse(bucket, &key, &bytes)?;
         let own = documents::own_version();
         if planned != own {
-            return Err(FleetError::Failed(format!(
+            return Err(EncodeError::Failed(format!(
                 "run {} was planned by slag-encoder {planned}, this is {own}: install the same program on all machines of the \
                  fleet",
                 run.0
@@ -83,38 +83,35 @@ impl Run {
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }
 
-    pub(super) fn is_first(bucket: &Bucket) -> Result<bool, FleetError> {
+    pub(super) fn is_first(bucket: &Bucket) -> Result<bool, EncodeError> {
         Ok(Self::newest(bucket)?.is_none())
     }
 
-    pub(super) fn is_open(self, bucket: &Bucket) -> Result<bool, FleetError> {
+    pub(super) fn is_open(self, bucket: &Bucket) -> Result<bool, EncodeError> {
         Ok(!self.has_ended(bucket)? && bucket.len_of(&self.key(DONE))?.is_none())
     }
 
-    fn has_ended(self, bucket: &Bucket) -> Result<bool, FleetError> {
+    fn has_ended(self, bucket: &Bucket) -> Result<bool, EncodeError> {
         Ok(bucket.len_of(&self.key(END))?.is_some())
     }
 
     /// Dismisses the workers: all views are in the bucket, or have failed.
-    pub(super) fn views_are_done(self, bucket: &Bucket) -> Result<(), FleetError> {
+    pub(super) fn views_are_done(self, bucket: &Bucket) -> Result<(), EncodeError> {
         Ok(bucket.put(&self.key(DONE), "")?)
     }
 
     /// Whether another coordinator has superseded the run; its own run follows at once.
-    ///
-    /// # Errors
-    /// [`FleetError::Blob`]; a document that is none.
-    pub(super) fn is_superseded(self, bucket: &Bucket) -> Result<bool, FleetError> {
+    pub(super) fn is_superseded(self, bucket: &Bucket) -> Result<bool, EncodeError> {
         let key = self.key(END);
         let Some(bytes) = bucket.get(&key)? else { return Ok(false) };
         Ok(documents::parse::<End>(bucket, &key, &bytes)? == End::Superseded)
     }
 
-    pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
+    pub(super) fn check(self, bucket: &Bucket) -> Result<(), EncodeError> {
         if self.has_ended(bucket)? { Err(self.superseded(bucket)) } else { Ok(()) }
     }
 
-    pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
+    pub(super) fn publish(self, bucket: &Bucket) -> Result<(), EncodeError> {
         // Only the run's own coordinator puts this.
         match bucket.claim(&self.key(END), documents::to_bytes(&End::Published)?)? {
             true => Ok(()),
@@ -122,8 +119,11 @@ impl Run {
         }
     }
 
-    fn superseded(self, bucket: &Bucket) -> FleetError {
-        FleetError::Superseded { run: self.0, url: bucket.url.clone() }
+    fn superseded(self, bucket: &Bucket) -> EncodeError {
+        EncodeError::Failed(format!(
+            "run {} was superseded: another `encode --blobs` uses {}. Let one of them finish, or give the other another prefix",
+            self.0, bucket.url
+        ))
     }
 }
 

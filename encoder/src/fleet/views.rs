@@ -6,8 +6,8 @@ use slag_common::View;
 
 use super::dispatch::Dispatcher;
 use super::documents::{self, FailedView};
+use super::objects;
 use super::prepared::Prepared;
-use super::{FleetError, objects};
 use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{
     PhotoSource, RunContext, ViewRecord, ViewSink, ViewStages, ViewTools, work_off,
@@ -51,7 +51,7 @@ impl ViewWork<'_> {
     }
 
     /// Does the available views; ends when there are none at present.
-    pub(super) fn run(&self) -> Result<(), FleetError> {
+    pub(super) fn run(&self) -> Result<(), EncodeError> {
         let prepared = self.prepared;
         let stages = ViewStages::new(self.tools());
         let source = views_to_do(self.dispatcher, &prepared.views, || self.context.is_cancelled());
@@ -59,12 +59,12 @@ impl ViewWork<'_> {
         work_off(&stages, source, |view, error| {
             // The coordinator warns of the first few.
             tracing::info!("view {} fails: {error}", view.name);
-            Ok(self.fail(view, &error.to_string())?)
+            self.fail(view, &error.to_string())
         })?;
         Ok(())
     }
 
-    fn fail(&self, view: &View, reason: &str) -> Result<(), FleetError> {
+    fn fail(&self, view: &View, reason: &str) -> Result<(), EncodeError> {
         let number = self.prepared.number_of[&view.name];
         let document = documents::to_bytes(&FailedView { reason: reason.to_owned() })?;
         self.bucket.put_new(&self.prepared.run.failed_key(number), document)?;

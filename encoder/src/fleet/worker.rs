@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::FleetError;
 use super::dispatch::{Dispatcher, Share};
 use super::documents::{self, FailedView, RunPlan};
 use super::heartbeat::HeartbeatWatch;
@@ -69,7 +68,7 @@ pub(crate) fn work(
     engines: &Engines<'_>,
     progress: &dyn Progress,
     cancel: &AtomicBool,
-) -> Result<WorkReport, FleetError> {
+) -> Result<WorkReport, EncodeError> {
     let context = RunContext::new(settings.n_threads, progress, cancel)?;
     let mut report = WorkReport::default();
     let mut waiting_since = Instant::now();
@@ -89,7 +88,7 @@ pub(crate) fn work(
         }
     }
     if report == WorkReport::default() && !context.is_cancelled() && Run::is_first(bucket)? {
-        return Err(FleetError::Failed(format!(
+        return Err(EncodeError::Failed(format!(
             "{}: no encode began within {:.0} s; check --blobs, or wait longer with --wait",
             bucket.url,
             settings.patience.as_secs_f64()
@@ -105,7 +104,7 @@ fn work_for(
     engines: &Engines<'_>,
     context: &RunContext<'_>,
     report: &mut WorkReport,
-) -> Result<(), FleetError> {
+) -> Result<(), EncodeError> {
     let folder = RunFolder::make(&settings.folder)?;
     let of_scene = plan.of_scene;
     let prepared = Prepared::fetch(bucket, (run, plan), folder.path(), settings.segmenter.as_ref(), context)?;
@@ -118,7 +117,7 @@ fn work_for(
             Box::new(Queue::open(&bucket.runtime, queue, run, of_scene, n_held)?)
         }
     };
-    let scene = context.install(|| engines.rasterizer.load(&prepared.scene)).map_err(EncodeError::from)?;
+    let scene = context.install(|| engines.rasterizer.load(&prepared.scene))?;
     let work = ViewWork {
         context,
         bucket,
@@ -137,7 +136,7 @@ fn work_for(
     result
 }
 
-fn while_open(work: &ViewWork<'_>, mut coordinator: HeartbeatWatch) -> Result<(), FleetError> {
+fn while_open(work: &ViewWork<'_>, mut coordinator: HeartbeatWatch) -> Result<(), EncodeError> {
     let ViewWork { context, bucket, dispatcher, prepared, .. } = *work;
     loop {
         dispatcher.offer(&mut || open_views(bucket, prepared))?;
@@ -156,7 +155,7 @@ fn while_open(work: &ViewWork<'_>, mut coordinator: HeartbeatWatch) -> Result<()
 }
 
 /// Views that are neither done nor given up, costly ones first.
-fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<usize>, FleetError> {
+fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<usize>, EncodeError> {
     let done: BTreeSet<String> = bucket.list("views")?.into_iter().collect();
     let failed = bucket.list(&prepared.run.failed_folder())?;
     let failed: BTreeSet<usize> =
@@ -168,7 +167,7 @@ fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<usize>, FleetE
 }
 
 /// Records views that ended several workers, so that the run goes on without them.
-fn record_failures(bucket: &Bucket, run: Run, dispatcher: &dyn Dispatcher) -> Result<(), FleetError> {
+fn record_failures(bucket: &Bucket, run: Run, dispatcher: &dyn Dispatcher) -> Result<(), EncodeError> {
     for view in dispatcher.take_dead() {
         let reason = "it was given to workers several times, and none left a result; their logs say why";
         let document = documents::to_bytes(&FailedView { reason: reason.into() })?;
@@ -192,7 +191,7 @@ pub(super) struct RunFolder {
 
 impl RunFolder {
     /// Makes a folder under `parent`, and removes those of killed workers.
-    pub(super) fn make(parent: &Path) -> Result<Self, FleetError> {
+    pub(super) fn make(parent: &Path) -> Result<Self, EncodeError> {
         fs_err::create_dir_all(parent)?;
         remove_left(parent);
         let name = format!("{PREFIX}{}-", std::process::id());

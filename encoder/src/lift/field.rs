@@ -144,11 +144,12 @@ pub fn read_field(
     cell_id: u32,
     n_gaussians: u32,
     n_regions: usize,
-) -> Result<CellField, ReadFieldError> {
+) -> Result<CellField, StoreError> {
     let read_part = |part| {
         let name = extra_field(cell_id, part);
         let bytes = read_extra(reader, &name)?;
-        CellField::from_bytes(&bytes, n_regions).map_err(|source| ReadFieldError::Damaged { name, source })
+        CellField::from_bytes(&bytes, n_regions)
+            .map_err(|fault| StoreError::Failed(format!("{name}: {fault}")))
     };
     let mut field = read_part(0)?;
     for part in 1.. {
@@ -160,24 +161,13 @@ pub fn read_field(
     Ok(field)
 }
 
-pub fn read_regions(reader: &StoreReader) -> Result<RegionTable, ReadFieldError> {
+pub fn read_regions(reader: &StoreReader) -> Result<RegionTable, StoreError> {
     let bytes = read_extra(reader, EXTRA_REGIONS)?;
-    RegionTable::from_bytes(&bytes)
-        .map_err(|source| ReadFieldError::Damaged { name: EXTRA_REGIONS.into(), source })
+    RegionTable::from_bytes(&bytes).map_err(|fault| StoreError::Failed(format!("{EXTRA_REGIONS}: {fault}")))
 }
 
-fn read_extra(reader: &StoreReader, name: &str) -> Result<AlignedBytes, ReadFieldError> {
-    let hash =
-        reader.current().extras.get(name).ok_or_else(|| ReadFieldError::Absent { name: name.to_owned() })?;
-    Ok(reader.read_object(*hash)?)
-}
-
-#[derive(Debug, thiserror::Error)]
-pub enum ReadFieldError {
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    #[error("the store has no {name}: another version published it; encode again")]
-    Absent { name: String },
-    #[error("{name}: {source}")]
-    Damaged { name: String, source: ContainerError },
+fn read_extra(reader: &StoreReader, name: &str) -> Result<AlignedBytes, StoreError> {
+    let absent = || format!("the store has no {name}: another version published it; encode again");
+    let hash = reader.current().extras.get(name).ok_or_else(|| StoreError::Failed(absent()))?;
+    reader.read_object(*hash)
 }

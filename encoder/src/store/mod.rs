@@ -69,6 +69,9 @@ pub enum StoreError {
     /// A message that says what to do.
     #[error("{0}")]
     Failed(String),
+    /// Two generations cannot be compared: why, and what to do.
+    #[error("{0}")]
+    NotComparable(String),
     #[error("{} is missing: nothing has been published here yet; run `slag-encoder encode` first", path.display())]
     NotPublished { path: PathBuf },
     #[error("{} is missing, though a scene was published here; run `slag-encoder encode` again, which writes it anew", path.display())]

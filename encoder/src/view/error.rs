@@ -4,8 +4,6 @@ use axum::http::StatusCode;
 use slag_models::InferenceError;
 use slag_service::problem::Problem;
 
-use crate::diff::DiffError;
-use crate::lift::field::ReadFieldError;
 use crate::store::StoreError;
 
 #[derive(Debug, thiserror::Error)]
@@ -14,8 +12,6 @@ pub(crate) enum ViewError {
     NoStore,
     #[error(transparent)]
     Store(#[from] StoreError),
-    #[error(transparent)]
-    Field(#[from] ReadFieldError),
     #[error(
         "the splat has {found} Gaussians, but the store was encoded from one with {expected}; give that one with --scene"
     )]
@@ -24,8 +20,6 @@ pub(crate) enum ViewError {
     NoCell { cell_id: u32 },
     #[error("the store has one generation alone; encode again into it, and what changed is shown")]
     OneGeneration,
-    #[error(transparent)]
-    Changes(#[from] DiffError),
     #[error("{0}")]
     Models(String),
     #[error(transparent)]
@@ -44,7 +38,7 @@ impl From<ViewError> for Problem {
                 (StatusCode::UNPROCESSABLE_ENTITY, "unknown-words", "Unknown words")
             }
             ViewError::OneGeneration => (StatusCode::CONFLICT, "one-generation", "One generation"),
-            ViewError::Changes(DiffError::NoObjects { .. } | DiffError::Encoders { .. }) => {
+            ViewError::Store(StoreError::NotComparable(_)) => {
                 (StatusCode::CONFLICT, "not-comparable", "Not comparable")
             }
             ViewError::Models(_) => (StatusCode::CONFLICT, "encoder-mismatch", "No text model"),

@@ -5,17 +5,17 @@ use std::io::{self, BufReader, Cursor};
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DVec3};
-use image::{DynamicImage, ImageError, ImageFormat, Rgb, RgbImage};
+use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use slag_common::photo;
 use slag_common::{Gaussians, Intrinsics, durable, npy};
 
 use super::looks::pinhole;
-use super::plan::{Viewpoint, ViewpointPlan};
+use super::plan::{Viewpoint, ViewpointError, ViewpointPlan};
 use crate::ingest;
 use crate::progress::Progress;
-use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer, check_near_plane};
+use crate::raster::{Drawing, LoadedScene, RasterView, Rasterizer, check_near_plane};
 
 pub const POSES_FILE: &str = "transforms.json";
 /// Size of drawings, pixels: that of the photos that the segmenter learnt on, enlarged little.
@@ -24,19 +24,6 @@ const SIZE_PX: [u32; 2] = [800, 600];
 const BACKGROUND: [f32; 3] = [0.5; 3];
 /// Distance of the pixels that bound a sharpened pixel's colour.
 const REACH_PX: i64 = 3;
-
-#[derive(Debug, thiserror::Error)]
-pub enum DrawError {
-    #[error(transparent)]
-    Scene(#[from] RasterError),
-    #[error(transparent)]
-    Io(#[from] io::Error),
-    #[error("a drawing as PNG: {0}")]
-    Image(#[from] ImageError),
-    /// Of a view or a file, which it names.
-    #[error("{0}")]
-    Failed(String),
-}
 
 /// A view to draw, with its file name below `images/`.
 #[derive(Clone, Debug)]
@@ -59,7 +46,7 @@ pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
 }
 
 /// Refuses a folder with poses or images that were not drawn, as the poses file says.
-pub(crate) fn check_folder(folder: &Path) -> Result<(), DrawError> {
+pub(crate) fn check_folder(folder: &Path) -> Result<(), ViewpointError> {
     let poses = folder.join(POSES_FILE);
     if ingest::drawn_from(&poses).is_some() {
         return Ok(());
@@ -67,7 +54,7 @@ pub(crate) fn check_folder(folder: &Path) -> Result<(), DrawError> {
     let has_files = |path: &PathBuf| fs_err::read_dir(path).is_ok_and(|mut found| found.next().is_some());
     let images = ["images", "depth", "coverage"].map(|name| folder.join(name)).into_iter().find(has_files);
     match images.or_else(|| poses.exists().then_some(poses)) {
-        Some(path) => Err(DrawError::Failed(format!(
+        Some(path) => Err(ViewpointError::Refused(format!(
             "{}: this was not drawn by slag-encoder, so it is not replaced; name another folder, or move it away",
             path.display()
         ))),
@@ -84,7 +71,7 @@ pub fn draw(
     drawn_from: &str,
     with_depth: bool,
     progress: &dyn Progress,
-) -> Result<(), DrawError> {
+) -> Result<(), ViewpointError> {
     begin(folder, drawn_from)?;
     draw_images(folder, views, scene, progress, |view, drawing, _| {
         if with_depth {
@@ -122,7 +109,7 @@ pub fn draw_sharpened(
     drawn_from: &str,
     about: Value,
     progress: &dyn Progress,
-) -> Result<(), DrawError> {
+) -> Result<(), ViewpointError> {
     check_near_plane(scene, &views.iter().map(|view| view.view).collect::<Vec<_>>())?;
     begin(folder, drawn_from)?;
     let scales = scene.scales.clone();
@@ -139,16 +126,16 @@ pub fn draw_sharpened(
 }
 
 /// Marks a folder as ours, without views, so that drawing can begin anew after an interruption.
-fn begin(folder: &Path, drawn_from: &str) -> Result<(), DrawError> {
+fn begin(folder: &Path, drawn_from: &str) -> Result<(), ViewpointError> {
     check_folder(folder)?;
     fs_err::create_dir_all(folder)?;
     write_poses(folder, &[], drawn_from, json!({}))
 }
 
-fn read(path: &Path) -> Result<RgbImage, DrawError> {
+fn read(path: &Path) -> Result<RgbImage, ViewpointError> {
     let input = BufReader::new(fs_err::File::open(path)?);
     let read = photo::open(input).and_then(|decoder| Ok(DynamicImage::from_decoder(decoder)?.into_rgb8()));
-    read.map_err(|fault| DrawError::Failed(format!("{}: {fault}", path.display())))
+    read.map_err(|fault| ViewpointError::Refused(format!("{}: {fault}", path.display())))
 }
 
 /// Writes each view's drawing as `finish` makes it, which gets the file to replace.
@@ -157,11 +144,11 @@ fn draw_images(
     views: &[DrawnView],
     scene: &dyn LoadedScene,
     progress: &dyn Progress,
-    finish: impl Fn(&DrawnView, Drawing, &Path) -> Result<RgbImage, DrawError> + Sync,
-) -> Result<(), DrawError> {
+    finish: impl Fn(&DrawnView, Drawing, &Path) -> Result<RgbImage, ViewpointError> + Sync,
+) -> Result<(), ViewpointError> {
     progress.begin("draw", "view", views.len() as u64, 0);
     let draw_one = |view: &DrawnView| {
-        let failed = |source| DrawError::Failed(format!("view {}: {source}", view.name));
+        let failed = |source| ViewpointError::Refused(format!("view {}: {source}", view.name));
         let drawing = scene.draw(&view.view, BACKGROUND).map_err(failed)?;
         let path = folder.join("images").join(&view.name);
         path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
@@ -171,7 +158,12 @@ fn draw_images(
         progress.advance(1);
         Ok(())
     };
-    views.par_iter().map(draw_one).collect::<Vec<_>>().into_iter().collect::<Result<Vec<()>, DrawError>>()?;
+    views
+        .par_iter()
+        .map(draw_one)
+        .collect::<Vec<_>>()
+        .into_iter()
+        .collect::<Result<Vec<()>, ViewpointError>>()?;
     progress.end();
     Ok(())
 }
@@ -205,7 +197,12 @@ fn extreme(image: &RgbImage, of: fn(u8, u8) -> u8) -> RgbImage {
     along(&along(image, [1, 0]), [0, 1])
 }
 
-fn write_poses(folder: &Path, views: &[DrawnView], drawn_from: &str, about: Value) -> Result<(), DrawError> {
+fn write_poses(
+    folder: &Path,
+    views: &[DrawnView],
+    drawn_from: &str,
+    about: Value,
+) -> Result<(), ViewpointError> {
     let text = serde_json::to_vec_pretty(&poses(views, drawn_from, about)).map_err(io::Error::from)?;
     Ok(durable::write(&folder.join(POSES_FILE), &text)?)
 }

@@ -20,7 +20,7 @@ use looks::Look;
 use space::Space;
 
 pub(crate) use draw::check_folder;
-pub(crate) use draw::{DrawError, DrawnView, views_of};
+pub(crate) use draw::{DrawnView, views_of};
 pub use draw::{POSES_FILE, draw, draw_sharpened};
 pub(crate) use plan::Viewpoint;
 pub use plan::{SceneKind, Verdict, ViewpointError, ViewpointPlan, ViewpointSettings};

@@ -60,7 +60,11 @@ pub enum ViewpointError {
     Raster(#[from] RasterError),
     #[error(transparent)]
     Memory(#[from] MemoryError),
-    /// Why, and what to give.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    #[error("a drawing as PNG: {0}")]
+    Image(#[from] image::ImageError),
+    /// Why, and what to do.
     #[error("{0}")]
     Refused(String),
     #[error("interrupted while views were planned; run the same command again")]

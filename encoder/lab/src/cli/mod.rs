@@ -4,16 +4,13 @@ mod generate;
 #[cfg(feature = "measure")]
 mod measure;
 
-use std::path::PathBuf;
-
 use anyhow::Result;
-use clap::{Args, Parser, Subcommand};
-use slag_encoder::cli::common::{OutputArgs, cancel_flag, now_unix_secs, print, session_options};
+use clap::{Parser, Subcommand};
+use slag_encoder::cli::common::{OutputArgs, print};
 use slag_encoder::cli::{Exit, exit_of, progress};
 use slag_encoder::progress::Progress;
-use slag_models::commands::RunArgs;
 
-use crate::demo;
+use crate::demo::{self, DemoArgs};
 
 /// Generates scenes with known contents, evaluates encoders and stores on them, and benchmarks this machine.
 #[derive(Debug, Parser)]
@@ -58,35 +55,13 @@ pub fn run(cli: Cli) -> Exit {
     exit_of(result, json)
 }
 
-#[derive(Debug, Args)]
-struct DemoArgs {
-    /// Working folder; an earlier demo in it is deleted.
-    #[arg(long, value_name = "DIR", default_value = "target/demo")]
-    out: PathBuf,
-    /// Seed of room and yard.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
-    /// Model runtime.
-    #[command(flatten)]
-    how: RunArgs,
-    /// Keeps the services running until ctrl-c, for queries of your own.
-    #[arg(long)]
-    keep: bool,
-}
-
 fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let options = demo::DemoOptions {
-        out: args.out.clone(),
-        seed: args.seed,
-        session: session_options(&args.how)?,
-        created_unix_secs: now_unix_secs()?,
-    };
-    let demo = demo::run(&options, progress, cancel_flag()?.as_ref())?;
-    print(json, &demo.report, &demo.report)?;
+    let report = demo::run(args, progress)?;
+    print(json, &report, &report)?;
     if args.keep {
-        demo.keep()?;
+        demo::keep(args, &report)?;
     }
-    Ok(if demo.report.all_right() { Exit::Done } else { Exit::Failed })
+    Ok(if report.all_right() { Exit::Done } else { Exit::Failed })
 }
 
 #[cfg(test)]

@@ -6,13 +6,14 @@ mod questions;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow};
+use clap::Args;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
-use slag_models::{ModelDir, SessionOptions, TextEncoder};
+use slag_models::commands::RunArgs;
+use slag_models::{ModelDir, TextEncoder};
 
 pub use picture::EdgeAnswer;
 
@@ -20,6 +21,7 @@ use crate::generate::Scene;
 use crate::generate::grammar::SceneKind;
 use crate::programs::{fetch, json_of, sibling};
 use slag_encoder::cells::CellLimits;
+use slag_encoder::cli::common::{cancel_flag, now_unix_secs, session_options};
 use slag_encoder::encode::{self, EncodeSettings, EncodeSummary, Engines};
 use slag_encoder::progress::Progress;
 use slag_encoder::query;
@@ -38,16 +40,20 @@ const TOLERANCE_M: f64 = 0.25;
 /// Marks a folder as a demo's, so that the next demo may empty it.
 const MARKER: &str = "demo.json";
 
-pub struct DemoOptions {
-    pub out: PathBuf,
-    pub seed: u64,
-    pub session: SessionOptions,
-    pub created_unix_secs: u64,
-}
-
-pub struct Demo {
-    pub report: DemoReport,
-    cache: PathBuf,
+#[derive(Debug, Args)]
+pub(crate) struct DemoArgs {
+    /// Working folder; an earlier demo in it is deleted.
+    #[arg(long, value_name = "DIR", default_value = "target/demo")]
+    out: PathBuf,
+    /// Seed of room and yard.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Model runtime.
+    #[command(flatten)]
+    how: RunArgs,
+    /// Keeps the services running until ctrl-c, for queries of your own.
+    #[arg(long)]
+    pub(crate) keep: bool,
 }
 
 #[derive(Debug, Serialize)]
@@ -91,35 +97,32 @@ impl DemoReport {
     }
 }
 
-impl Demo {
-    /// Serves the shards and the robot's queries until it is stopped.
-    pub fn keep(&self) -> Result<()> {
-        let store = self.cache.with_file_name("store");
-        let mut shards = Command::new(sibling("slag-encoder")?);
-        let mut shards =
-            shards.arg("serve").arg("--store").arg(store).spawn().context("cannot serve the store")?;
-        println!("try: curl 'http://127.0.0.1:7734/query?text=chair'");
-        if let Some(link) = self.report.link() {
-            println!("see: {link}");
-        }
-        let edge = sibling("slag-edge")?;
-        let status = Command::new(&edge).arg("serve").arg("--cache").arg(&self.cache).status();
-        // It may have ended already: ctrl-c reaches all processes of the terminal.
-        let _ = shards.kill();
-        let _ = shards.wait();
-        status.with_context(|| format!("cannot start {}", edge.display()))?;
-        Ok(())
+/// Serves the shards and the robot's queries until it is stopped.
+pub(crate) fn keep(args: &DemoArgs, report: &DemoReport) -> Result<()> {
+    let mut shards = Command::new(sibling("slag-encoder")?);
+    shards.arg("serve").arg("--store").arg(args.out.join("store"));
+    let mut shards = shards.spawn().context("cannot serve the store")?;
+    println!("try: curl 'http://127.0.0.1:7734/query?text=chair'");
+    if let Some(link) = report.link() {
+        println!("see: {link}");
     }
+    let edge = sibling("slag-edge")?;
+    let status = Command::new(&edge).arg("serve").arg("--cache").arg(args.out.join("cache")).status();
+    // It may have ended already: ctrl-c reaches all processes of the terminal.
+    let _ = shards.kill();
+    let _ = shards.wait();
+    status.with_context(|| format!("cannot start {}", edge.display()))?;
+    Ok(())
 }
 
-pub fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
+pub(crate) fn run(args: &DemoArgs, progress: &dyn Progress) -> Result<DemoReport> {
     // Before any work.
     let edge = sibling("slag-edge")?;
-    clear(&options.out)?;
-    let (store, cache) = (options.out.join("store"), options.out.join("cache"));
-    let mut scene = Scene::new(&KINDS, options.seed, N_VIEWS);
-    let models = ModelDir::embedded()?;
-    let encode = encode(options, &mut scene, &store, &models, (progress, cancel))?;
+    clear(&args.out)?;
+    let (store, cache) = (args.out.join("store"), args.out.join("cache"));
+    let mut scene = Scene::new(&KINDS, args.seed, N_VIEWS);
+    let (models, session) = (ModelDir::embedded()?, session_options(&args.how)?);
+    let encode = encode(&args.out, &mut scene, &Engines::new(&models, &session, &CpuRasterizer), progress)?;
     let camera_in_world = scene.views[ROBOT_VIEW].camera_from_world.inverse().translation;
     let robot_in_world = DVec3::new(camera_in_world.x, camera_in_world.y, 0.0);
     let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
@@ -128,32 +131,30 @@ pub fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) 
     let downloaded_bytes = fetched["downloaded"]["bytes"].as_u64().context("fetch: no downloaded bytes")?;
     // The robot is offline from here on.
     let questions = ask(&edge, &cache, &scene, (robot_in_world, &at))?;
-    let mut encoder = models.text_encoder(&options.session)?;
-    let pictures = draw(options, &scene, &questions, &mut *encoder, robot_in_world).context("pictures")?;
+    let mut encoder = models.text_encoder(&session)?;
+    let pictures = draw(&args.out, &scene, &questions, &mut *encoder, robot_in_world).context("pictures")?;
     let about_model = models.about().to_owned();
     let report = DemoReport { pictures, encode, downloaded_bytes, about_model, questions };
-    fs_err::write(options.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
-    Ok(Demo { report, cache })
+    fs_err::write(args.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
+    Ok(report)
 }
 
 fn encode(
-    options: &DemoOptions,
+    out: &Path,
     scene: &mut Scene,
-    store: &Path,
-    models: &ModelDir,
-    (progress, cancel): (&dyn Progress, &AtomicBool),
+    engines: &Engines<'_>,
+    progress: &dyn Progress,
 ) -> Result<EncodeSummary> {
-    let written = scene.write(&options.out.join("scene"), progress).context("generate")?;
-    let mut settings = EncodeSettings::new(written.scene, written.views, store.to_owned(), true);
+    let written = scene.write(&out.join("scene"), progress).context("generate")?;
+    let mut settings = EncodeSettings::new(written.scene, written.views, out.join("store"), true);
     settings.output.scene_name = "demo house and yard".into();
-    settings.output.created_unix_secs = options.created_unix_secs;
+    settings.output.created_unix_secs = now_unix_secs()?;
     settings.run.memory_bytes = 1 << 30;
     settings.run.strict = true;
     // So that the robot's page shows colours, too.
     settings.cells.shards.compact_appearance = true;
     settings.cells.limits = CellLimits { max_gaussians: 16_384, ..settings.cells.limits };
-    let engines = Engines::new(models, &options.session, &CpuRasterizer);
-    encode::encode(&settings, &engines, progress, cancel).context("encode")
+    encode::encode(&settings, engines, progress, cancel_flag()?.as_ref()).context("encode")
 }
 
 /// Asks the robot, and compares its answers with the truth. `at`: the robot's position as a flag.
@@ -186,13 +187,13 @@ fn ask(
 
 /// Draws the answers, from the full-precision scores of the store, and the map.
 fn draw(
-    options: &DemoOptions,
+    out: &Path,
     scene: &Scene,
     questions: &[Question],
     text: &mut dyn TextEncoder,
     robot_in_world: DVec3,
 ) -> Result<[PathBuf; 2]> {
-    let reader = StoreReader::open(&options.out.join("store"))?;
+    let reader = StoreReader::open(&out.join("store"))?;
     let threshold = reader.manifest().encoder.default_threshold;
     let mut panels = Vec::new();
     for question in questions {
@@ -201,7 +202,7 @@ fn draw(
             panels.push(picture::Panel { question: &question.text, answer, cosines, threshold });
         }
     }
-    let paths = ["answers.png", "map.png"].map(|name| options.out.join(name));
+    let paths = ["answers.png", "map.png"].map(|name| out.join(name));
     picture::answers(&scene.gaussians, &scene.views, &panels)?.save(&paths[0])?;
     let answers: Vec<DVec3> = panels.iter().map(|panel| panel.answer.position_in_world).collect();
     let cells: Vec<_> = reader.manifest().cells.iter().map(|cell| cell.bounds).collect();

@@ -20,7 +20,7 @@ use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
-use truth::Asked;
+use truth::{Asked, QUESTIONS};
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
@@ -58,7 +58,7 @@ struct Question {
 }
 
 pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<RelationsReport> {
-    let mut report = RelationsReport::default();
+    let mut counts = BTreeMap::new();
     let scenes = Prepared {
         out: &args.out,
         kinds: &args.kind,
@@ -67,11 +67,15 @@ pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<Relat
         walk: Walk::Oval,
         encode_flags: &[],
     };
-    report.scenes = scenes.judge(progress, |_, _, dir| judge(dir, &mut report))?;
-    Ok(report)
+    let scenes = scenes.judge(progress, |_, _, dir| judge(dir, &mut counts))?;
+    let row = |((_, relation, has_answer, way), counts)| Row { relation, has_answer, way, counts };
+    Ok(RelationsReport { scenes, rows: counts.into_iter().map(row).collect() })
 }
 
-fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
+/// By whether all relations are meant, the relation, whether a thing is meant, and how it is asked for.
+type AllCounts = BTreeMap<(bool, Option<Asked>, bool, Way), Counts>;
+
+fn judge(dir: &Path, counts: &mut AllCounts) -> Result<()> {
     let (things, _) = read_things(&dir.join("scene"))?;
     let robot = middle(&things);
     let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
@@ -81,18 +85,17 @@ fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
             let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
             let is_right = |at: &Option<usize>| at.is_some_and(|at| question.truth.contains(&at));
             let distinct: BTreeSet<usize> = found.iter().copied().flatten().collect();
-            let counts = Counts {
-                n_questions: 1,
-                n_right: usize::from(match found.first() {
-                    Some(first) => is_right(first),
-                    None => question.truth.is_empty(),
-                }),
-                n_answers: found.len(),
-                n_answers_right: found.iter().filter(|at| is_right(at)).count(),
-                n_meant: question.truth.len(),
-                n_meant_found: distinct.iter().filter(|at| question.truth.contains(at)).count(),
-            };
-            report.count(question.asked, !question.truth.is_empty(), way, counts);
+            let is_best_right = found.first().map_or(question.truth.is_empty(), is_right);
+            for relation in [Some(question.asked), None] {
+                let key = (relation.is_none(), relation, !question.truth.is_empty(), way);
+                let counts = counts.entry(key).or_default();
+                counts.n_questions += 1;
+                counts.n_right += usize::from(is_best_right);
+                counts.n_answers += found.len();
+                counts.n_answers_right += found.iter().filter(|at| is_right(at)).count();
+                counts.n_meant += question.truth.len();
+                counts.n_meant_found += distinct.iter().filter(|at| question.truth.contains(at)).count();
+            }
         }
     }
     Ok(())
@@ -119,7 +122,7 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     let several = n_of_kind.into_iter().filter(|(_, n)| *n > 1).map(|(kind, _)| kind);
     let ones: Vec<&str> = nouns.iter().copied().chain(several).collect();
     let mut all = Vec::new();
-    for asked in Asked::ALL {
+    for (asked, text) in QUESTIONS {
         let mut of_relation: [Vec<Question>; 2] = [Vec::new(), Vec::new()];
         for thing in &ones {
             for of in nouns.iter().filter(|of| *of != thing) {
@@ -134,7 +137,7 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
                 if truth.iter().any(|at| things[*at].train_pixels < MIN_PIXELS) {
                     continue;
                 }
-                let text = asked.text(thing, of);
+                let text = text.replace("{A}", thing).replace("{B}", of);
                 let has_answer = usize::from(!truth.is_empty());
                 of_relation[has_answer].push(Question { asked, thing: (*thing).to_owned(), text, truth });
             }
@@ -215,17 +218,6 @@ struct Counts {
     n_meant_found: usize,
 }
 
-impl Counts {
-    fn add(&mut self, other: Self) {
-        self.n_questions += other.n_questions;
-        self.n_right += other.n_right;
-        self.n_answers += other.n_answers;
-        self.n_answers_right += other.n_answers_right;
-        self.n_meant += other.n_meant;
-        self.n_meant_found += other.n_meant_found;
-    }
-}
-
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     /// `None` for all of them.
@@ -236,42 +228,10 @@ struct Row {
     counts: Counts,
 }
 
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Serialize)]
 pub(crate) struct RelationsReport {
     scenes: Vec<String>,
-    counts: BTreeMap<(Asked, bool, Way), Counts>,
-}
-
-impl RelationsReport {
-    /// Adds what came of a question. `has_answer`: whether a thing is meant.
-    fn count(&mut self, asked: Asked, has_answer: bool, way: Way, counts: Counts) {
-        self.counts.entry((asked, has_answer, way)).or_default().add(counts);
-    }
-
-    fn rows(&self) -> Vec<Row> {
-        let row = |relation, has_answer, way, counts| Row { relation, has_answer, way, counts };
-        let each =
-            self.counts.iter().map(|((asked, has, way), counts)| row(Some(*asked), *has, *way, *counts));
-        let total = |(has_answer, way)| {
-            let mut total = Counts::default();
-            let of = self.counts.iter().filter(|((_, has, by), _)| *has == has_answer && *by == way);
-            of.for_each(|(_, counts)| total.add(*counts));
-            row(None, has_answer, way, total)
-        };
-        let totals = [true, false].into_iter().flat_map(|has| Way::ALL.map(|way| (has, way)));
-        each.chain(totals.map(total)).collect()
-    }
-}
-
-impl Serialize for RelationsReport {
-    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
-        #[derive(Serialize)]
-        struct Report<'a> {
-            scenes: &'a [String],
-            rows: Vec<Row>,
-        }
-        Report { scenes: &self.scenes, rows: self.rows() }.serialize(to)
-    }
+    rows: Vec<Row>,
 }
 
 impl fmt::Display for RelationsReport {
@@ -279,11 +239,11 @@ impl fmt::Display for RelationsReport {
         writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
         let columns = ["relation", "answer", "asked as", "questions", "best right", "precision", "recall"];
         let mut table = Table::new(columns);
-        for Row { relation, has_answer, way, counts } in self.rows() {
+        for Row { relation, has_answer, way, counts } in &self.rows {
             let percent = |n: usize, of: usize| percent(n as u64, of as u64);
             table.row([
                 relation.map_or("all".into(), |relation| format!("{relation:?}")),
-                if has_answer { "some" } else { "none" }.to_owned(),
+                if *has_answer { "some" } else { "none" }.to_owned(),
                 format!("{way:?}"),
                 counts.n_questions.to_string(),
                 percent(counts.n_right, counts.n_questions),

@@ -35,35 +35,19 @@ pub(super) enum Asked {
     Largest,
 }
 
-impl Asked {
-    pub(super) const ALL: [Self; 10] = [
-        Self::On,
-        Self::Near,
-        Self::Beside,
-        Self::LeftOf,
-        Self::RightOf,
-        Self::InFrontOf,
-        Self::Behind,
-        Self::Nearest,
-        Self::Second,
-        Self::Largest,
-    ];
-
-    pub(super) fn text(self, thing: &str, of: &str) -> String {
-        match self {
-            Self::On => format!("{thing} on the {of}"),
-            Self::Near => format!("{thing} near the {of}"),
-            Self::Beside => format!("{thing} beside the {of}"),
-            Self::LeftOf => format!("{thing} left of the {of}"),
-            Self::RightOf => format!("{thing} right of the {of}"),
-            Self::InFrontOf => format!("{thing} in front of the {of}"),
-            Self::Behind => format!("{thing} behind the {of}"),
-            Self::Nearest => format!("nearest {thing} to the {of}"),
-            Self::Second => format!("second {thing} from the {of}"),
-            Self::Largest => format!("largest {thing} near the {of}"),
-        }
-    }
-}
+/// Each relation's question about a thing `A` and another `B`.
+pub(super) const QUESTIONS: [(Asked, &str); 10] = [
+    (Asked::On, "{A} on the {B}"),
+    (Asked::Near, "{A} near the {B}"),
+    (Asked::Beside, "{A} beside the {B}"),
+    (Asked::LeftOf, "{A} left of the {B}"),
+    (Asked::RightOf, "{A} right of the {B}"),
+    (Asked::InFrontOf, "{A} in front of the {B}"),
+    (Asked::Behind, "{A} behind the {B}"),
+    (Asked::Nearest, "nearest {A} to the {B}"),
+    (Asked::Second, "second {A} from the {B}"),
+    (Asked::Largest, "largest {A} near the {B}"),
+];
 
 impl Thing {
     pub(super) fn bounds(&self) -> Aabb {
