@@ -3,6 +3,7 @@
 use std::ffi::OsStr;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
@@ -403,19 +404,19 @@ pub(crate) struct SamArgs {
         value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
     sam_points_per_batch: u32,
     /// Least IoU that the model predicts for a mask, 0 to 1 [default: the preset's].
-    #[arg(long, requires = "segmenter", value_name = "IOU", value_parser = parse_f32_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", value_parser = parse_ratio::<f32>, hide_short_help = true)]
     sam_predicted_iou: Option<f32>,
     /// Least IoU of a mask with itself under a higher and a lower threshold, 0 to 1 [default: the preset's].
-    #[arg(long, requires = "segmenter", value_name = "IOU", value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", value_parser = parse_ratio::<f64>, hide_short_help = true)]
     sam_stability: Option<f64>,
     /// Distance of those thresholds from 0, logits.
     #[arg(long, requires = "segmenter", value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset, hide_short_help = true)]
     sam_stability_offset: f32,
     /// IoU of boxes from which two masks are the same.
-    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio::<f64>, hide_short_help = true)]
     sam_box_nms: f64,
     /// IoU of pixels from which two masks are the same; 1 compares boxes only.
-    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio::<f64>, hide_short_help = true)]
     sam_mask_nms: f64,
     /// Layers of crops, to find small things: layer i segments 4^i crops besides the whole image [default: the
     /// preset's].
@@ -423,7 +424,7 @@ pub(crate) struct SamArgs {
         value_parser = clap::value_parser!(u32).range(0..=4), hide_short_help = true)]
     sam_crop_layers: Option<u32>,
     /// IoU of boxes from which masks of two crops are the same.
-    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio::<f64>, hide_short_help = true)]
     sam_crop_nms: f64,
     /// Fills holes and drops islands of masks with fewer pixels [default: the preset's].
     #[arg(long, requires = "segmenter", value_name = "PX", hide_short_help = true)]
@@ -460,18 +461,17 @@ impl SamArgs {
     }
 }
 
-fn parse_ratio(text: &str) -> Result<f64, String> {
-    let ratio: f64 = text.parse().map_err(|error| format!("{error}"))?;
-    (0.0..=1.0).contains(&ratio).then_some(ratio).ok_or_else(|| "expected 0 to 1".into())
-}
-
-fn parse_f32_ratio(text: &str) -> Result<f32, String> {
-    parse_ratio(text).map(|ratio| ratio as f32)
+fn parse_ratio<T: FromStr + Into<f64> + Copy>(text: &str) -> Result<T, String> {
+    parse_up_to(text, 1.0)
 }
 
 fn parse_offset(text: &str) -> Result<f32, String> {
-    let offset: f32 = text.parse().map_err(|error| format!("{error}"))?;
-    (0.0..=100.0).contains(&offset).then_some(offset).ok_or_else(|| "expected 0 to 100".into())
+    parse_up_to(text, 100.0)
+}
+
+fn parse_up_to<T: FromStr + Into<f64> + Copy>(text: &str, most: f64) -> Result<T, String> {
+    let number = text.parse().ok().filter(|number: &T| (0.0..=most).contains(&(*number).into()));
+    number.ok_or_else(|| format!("expected 0 to {most}"))
 }
 
 #[cfg(test)]

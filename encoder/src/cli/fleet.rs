@@ -10,57 +10,14 @@ use clap::Args;
 use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
-use super::common::{Exit, ModelArgs, available_threads, cancel_flag, open_models, parse_secs, print};
+use super::common::{Exit, ModelArgs, available_threads, cancel_flag, open_models, print};
 use super::memory::{default_memory_bytes, parse_memory};
 use crate::blobs::Bucket;
 use crate::encode::{self, EncodeSettings, EncodeSummary, Engines};
-use crate::fleet::{Coordinator, Dispatch, QueueSettings, WorkerSettings, work};
+use crate::fleet::{Coordinator, Dispatch, QueueSettings, WorkerSettings, parse_period, work};
 use crate::progress::{Progress, Silent};
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
-
-/// The queue of a fleet.
-#[derive(Clone, Debug, Args)]
-#[command(next_help_heading = "Fleet")]
-pub(crate) struct QueueArgs {
-    /// NATS server with JetStream that hands out the work; without it, workers have shares. TLS with tls://.
-    #[arg(long, value_name = "nats://HOST:PORT", hide_short_help = true)]
-    fleet: Option<String>,
-    /// Credentials file for the NATS server.
-    #[arg(long, value_name = "FILE", requires = "fleet", env = "NATS_CREDS", hide_short_help = true)]
-    nats_credentials: Option<PathBuf>,
-    /// File with the seed of an nkey for the NATS server.
-    #[arg(
-        long,
-        value_name = "FILE",
-        requires = "fleet",
-        conflicts_with = "nats_credentials",
-        hide_short_help = true
-    )]
-    nats_nkey: Option<PathBuf>,
-    /// Certificates of the authority that signed the NATS server's.
-    #[arg(long, value_name = "FILE", requires = "fleet", hide_short_help = true)]
-    nats_ca: Option<PathBuf>,
-    /// Seconds without a sign of life after which a worker's view goes to another.
-    #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_period, hide_short_help = true)]
-    ack_wait: Duration,
-    /// Times that a view is handed out; then it is left out.
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000), hide_short_help = true)]
-    max_deliver: u32,
-}
-
-impl QueueArgs {
-    fn settings(&self) -> Option<QueueSettings> {
-        Some(QueueSettings {
-            url: self.fleet.clone()?,
-            credentials: self.nats_credentials.clone(),
-            nkey: self.nats_nkey.clone(),
-            ca: self.nats_ca.clone(),
-            ack_wait: self.ack_wait,
-            max_deliver: self.max_deliver,
-        })
-    }
-}
 
 /// `encode` by a fleet.
 #[derive(Clone, Debug, Args)]
@@ -71,7 +28,7 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "URL", conflicts_with = "time_budget", hide_short_help = true)]
     blobs: Option<String>,
     #[command(flatten)]
-    queue: QueueArgs,
+    queue: QueueSettings,
 }
 
 impl CoordinatorArgs {
@@ -82,7 +39,7 @@ impl CoordinatorArgs {
         progress: &dyn Progress,
         cancel: &AtomicBool,
     ) -> Result<EncodeSummary> {
-        let queue = self.queue.settings();
+        let queue = self.queue.url.is_some().then(|| self.queue.clone());
         match &self.blobs {
             Some(url) => {
                 let coordinator = Coordinator::new(open_bucket(url)?, queue);
@@ -109,7 +66,7 @@ pub struct WorkerArgs {
     #[arg(long, value_name = "SECS", default_value = "120", value_parser = parse_period)]
     help_after: Duration,
     #[command(flatten)]
-    queue: QueueArgs,
+    queue: QueueSettings,
     /// Models, as the coordinator has them.
     #[command(flatten)]
     models: ModelArgs,
@@ -137,8 +94,8 @@ pub struct WorkerArgs {
 }
 
 pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
-    let dispatch = match (args.queue.settings(), args.index, args.of) {
-        (Some(queue), _, _) => Dispatch::Queue(queue),
+    let dispatch = match (&args.queue.url, args.index, args.of) {
+        (Some(_), _, _) => Dispatch::Queue(args.queue.clone()),
         (None, Some(index), Some(of)) if index < of => {
             Dispatch::Share { index: index as usize, of: of as usize, help_after: args.help_after }
         }
@@ -176,9 +133,4 @@ pub(super) fn open_bucket(url: &str) -> Result<Arc<Bucket>> {
     let variables =
         std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.into_string().ok()?)));
     Ok(Arc::new(Bucket::open(url, variables)?))
-}
-
-fn parse_period(text: &str) -> Result<Duration, String> {
-    let period = parse_secs(text).ok().filter(|period| period.as_millis() >= 100);
-    period.ok_or_else(|| "expected seconds, at least 0.1".into())
 }

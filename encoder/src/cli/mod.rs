@@ -204,27 +204,12 @@ mod tests {
             parse("slag-encoder encode --scene a.ply --views v --store s --memory 512MiB --masks auto")
                 .is_ok()
         );
-        for wrong in [
-            "--memory 1",
-            "--memory 5TB",
-            "--views-limit 0",
-            "--views-limit 0%",
-            "--views-limit 101%",
-            "--views-limit NaN%",
-            "--raster-width wide",
-            "--view-order best",
-            "--time-budget 0",
-            "--time-budget inf",
-            "--threads 0",
-            "--threads 1025",
-            "--model-threads 257",
-            "--sam-threads 1025",
-            "--preset best",
-        ] {
-            assert!(
-                parse(&format!("slag-encoder encode --scene a.ply --views v --store s {wrong}")).is_err(),
-                "{wrong}"
-            );
+        let wrong = "--memory 1,--memory 5TB,--views-limit 0,--views-limit 0%,--views-limit 101%,--views-limit NaN%,--raster-width \
+                     wide,--view-order best,--time-budget 0,--time-budget inf,--threads 0,--threads 1025,--model-threads 257,\
+                     --sam-threads 1025,--preset best";
+        for wrong in wrong.split(',') {
+            let line = format!("slag-encoder encode --scene a.ply --views v --store s {wrong}");
+            assert!(parse(&line).is_err(), "{wrong}");
         }
     }
 }

@@ -30,7 +30,7 @@ use crate::blobs::Bucket;
 use crate::encode::EncodeError;
 
 pub(crate) use coordinator::Coordinator;
-pub(crate) use queue::QueueSettings;
+pub(crate) use queue::{QueueSettings, parse_period};
 pub(crate) use worker::{Dispatch, WorkerSettings, work};
 
 fn damaged(bucket: &Bucket, key: &str, problem: impl std::fmt::Display) -> EncodeError {

@@ -14,6 +14,7 @@ use async_nats::ConnectOptions;
 use async_nats::jetstream::consumer::{AckPolicy, PullConsumer, pull};
 use async_nats::jetstream::stream::{self, RetentionPolicy};
 use async_nats::jetstream::{self, AckKind, Context, Message};
+use clap::Args;
 use futures_util::StreamExt;
 use slag_common::Hash32;
 use tokio::runtime::Runtime;
@@ -31,41 +32,65 @@ const RETRY_PAUSE: Duration = Duration::from_millis(300);
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Where work is handed out, and how patiently.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Args)]
+#[command(next_help_heading = "Fleet")]
 pub(crate) struct QueueSettings {
-    /// `nats://HOST:PORT` or `tls://HOST:PORT`, several with commas.
-    pub(crate) url: String,
-    pub(crate) credentials: Option<PathBuf>,
-    /// A file with the seed of an nkey.
-    pub(crate) nkey: Option<PathBuf>,
-    /// Certificates of authorities that sign the server's, beside the system's.
-    pub(crate) ca: Option<PathBuf>,
-    /// Time after which work of which nothing is heard goes to another worker.
-    pub(crate) ack_wait: Duration,
-    /// How often a view is handed out before it is given up.
-    pub(crate) max_deliver: u32,
+    /// NATS server with JetStream that hands out the work; without it, workers have shares. TLS with tls://.
+    #[arg(id = "fleet", long, value_name = "nats://HOST:PORT", hide_short_help = true)]
+    pub(crate) url: Option<String>,
+    /// Credentials file for the NATS server.
+    #[arg(long, value_name = "FILE", requires = "fleet", env = "NATS_CREDS", hide_short_help = true)]
+    nats_credentials: Option<PathBuf>,
+    /// File with the seed of an nkey for the NATS server.
+    #[arg(
+        long,
+        value_name = "FILE",
+        requires = "fleet",
+        conflicts_with = "nats_credentials",
+        hide_short_help = true
+    )]
+    nats_nkey: Option<PathBuf>,
+    /// Certificates of the authority that signed the NATS server's.
+    #[arg(long, value_name = "FILE", requires = "fleet", hide_short_help = true)]
+    nats_ca: Option<PathBuf>,
+    /// Seconds without a sign of life after which a worker's view goes to another.
+    #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_period, hide_short_help = true)]
+    ack_wait: Duration,
+    /// Times that a view is handed out; then it is left out.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000), hide_short_help = true)]
+    max_deliver: u32,
+}
+
+pub(crate) fn parse_period(text: &str) -> Result<Duration, String> {
+    let period = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok());
+    period.filter(|period| period.as_millis() >= 100).ok_or_else(|| "expected seconds, at least 0.1".into())
 }
 
 impl QueueSettings {
+    /// One address, or several with commas.
+    fn url(&self) -> &str {
+        self.url.as_deref().unwrap_or_default()
+    }
+
     async fn connect(&self) -> Result<Context, EncodeError> {
+        let url = self.url();
         let refuse = |problem: &dyn Display| {
             EncodeError::Failed(format!(
-                "{}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials",
-                self.url
+                "{url}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials"
             ))
         };
         let mut options = ConnectOptions::new().name("slag-encoder");
-        if let Some(path) = &self.credentials {
+        if let Some(path) = &self.nats_credentials {
             options = options.credentials_file(path).await.map_err(|e| refuse(&e))?;
         }
-        if let Some(path) = &self.nkey {
+        if let Some(path) = &self.nats_nkey {
             let seed = fs_err::read_to_string(path).map_err(|e| refuse(&e))?;
             options = options.nkey(seed.trim().to_owned());
         }
-        if let Some(path) = &self.ca {
+        if let Some(path) = &self.nats_ca {
             options = options.add_root_certificates(path.clone()).require_tls(true);
         }
-        let addresses: Vec<String> = self.url.split(',').map(str::to_owned).collect();
+        let addresses: Vec<String> = url.split(',').map(str::to_owned).collect();
         let client = options.connect(addresses).await.map_err(|e| refuse(&e))?;
         Ok(jetstream::new(client))
     }
@@ -115,7 +140,7 @@ impl Enqueuer {
         }
         let runtime = Arc::clone(&self.runtime);
         if let Err(problem) = runtime.block_on(self.look(open)) {
-            tracing::warn!("{}: {problem}; the queue is looked at again", self.settings.url);
+            tracing::warn!("{}: {problem}; the queue is looked at again", self.settings.url());
         }
         self.last_look = Some(Instant::now());
     }

@@ -36,7 +36,7 @@ const FORMS: [Form; 7] = [
         is_true: |a, b| use_of(a).is_some_and(|kind| b.kinds.contains(kind)),
     },
     Form {
-        text: |o| Some(format!("{} {}", adjective(o.material)?, o.category)),
+        text: |o| Some(format!("{} {}", adjective(&o.material)?, o.category)),
         is_true: |a, b| same_noun(a, b) && a.material == b.material,
     },
     Form { text: |o| Some(format!("where is the {}", o.category)), is_true: same_noun },

@@ -6,7 +6,7 @@
 use std::fmt;
 
 use anyhow::{Result, bail};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 use serde::Serialize;
 use slag_encoder::cli::common::{ModelArgs, open_models};
@@ -15,7 +15,7 @@ use slag_models::{Crop, TextEncoder};
 use super::judge::ABSENT;
 use crate::generate::crops::{self, Label, Split};
 use crate::generate::grammar::{NOUNS, Noun};
-use crate::generate::paint::{Colour, Material};
+use crate::generate::paint::{Colour, Material, word};
 use crate::harness::Times;
 use crate::table::Table;
 use slag_encoder::progress::Progress;
@@ -91,11 +91,13 @@ impl Texts {
         };
         Ok(Self {
             nouns: encode(NOUNS.iter().map(|noun| format!("a {}", noun.name)).collect())?,
-            colours: encode(Colour::ALL.iter().map(|c| format!("something {}", c.word())).collect())?,
-            materials: encode(
-                Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect(),
+            colours: encode(
+                Colour::value_variants().iter().map(|c| format!("something {}", word(c))).collect(),
             )?,
-            absent: encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?,
+            materials: encode(
+                Material::value_variants().iter().map(|m| format!("something made of {}", word(m))).collect(),
+            )?,
+            absent: encode(ABSENT.split(',').map(|thing| format!("a {thing}")).collect())?,
         })
     }
 }
@@ -151,7 +153,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
         threshold,
         found: share(found[0], 1),
         found_others: share(found[1], nouns.len() - 1),
-        found_absent: share(found[2], ABSENT.len()),
+        found_absent: share(found[2], texts.absent.len()),
         ms_per_crop: crop_times.median_ms,
         ms_per_text: text_times.median_ms,
     })
@@ -183,8 +185,8 @@ fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
         for (label, noun, colour, material) in seen.iter().filter(|s| is_in(&s.0)) {
             tally.n_crops += 1;
             tally.noun += usize::from(*noun == label.noun);
-            tally.colour += usize::from(Colour::ALL[*colour] == label.colour);
-            tally.material += usize::from(Material::ALL[*material] == label.material);
+            tally.colour += usize::from(Colour::value_variants()[*colour] == label.colour);
+            tally.material += usize::from(Material::value_variants()[*material] == label.material);
         }
         tally
     };

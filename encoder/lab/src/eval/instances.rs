@@ -74,14 +74,12 @@ impl fmt::Display for InstanceReport {
     }
 }
 
-/// `object_of`: the object of each Gaussian; `classes`: words with the ids of their things; `scores`: by word and
-/// object.
-pub(super) fn report(
+/// `object_of`: the object of each Gaussian; `classes`: the ids of each word's things, and its scores by object.
+pub(super) fn report<'a>(
     truth: &Truth,
     object_of: &[u32],
     n_objects: usize,
-    classes: &[(String, Vec<u16>)],
-    scores: &[Vec<f32>],
+    classes: impl Iterator<Item = (&'a [u16], &'a [f32])>,
     threshold: f32,
 ) -> InstanceReport {
     let mut n_of_object = vec![0u64; n_objects];
@@ -116,7 +114,7 @@ pub(super) fn report(
     // Things without Gaussians cannot be found.
     let things = truth.things.iter().map(|thing| thing.id).filter(|id| n_of_thing.contains_key(id));
     things.for_each(|thing| any.count(best_iou(thing, &|_| true)));
-    for ((_, ids), scores) in classes.iter().zip(scores) {
+    for (ids, scores) in classes {
         let ids: Vec<u16> = ids.iter().copied().filter(|id| n_of_thing.contains_key(id)).collect();
         let mut order: Vec<u32> = (0..n_objects as u32).collect();
         order.sort_by(|a, b| scores[*b as usize].total_cmp(&scores[*a as usize]).then(a.cmp(b)));
@@ -146,22 +144,24 @@ mod tests {
             id_of_gaussian: vec![7, 7, 7, 7, 8, 8, 8, 8, 1, 1],
         };
         let object_of = [0, 0, 0, NONE, 1, 2, 2, NONE, 2, 2];
-        let classes = [("chair".to_owned(), vec![7, 8]), ("table".to_owned(), vec![9])];
         // IoU: 3/4; 1/4 with object 1, 2/6 with object 2.
-        let found = |chair: Vec<f32>| report(&truth, &object_of, 3, &classes, &[chair, vec![0.9; 3]], 0.5);
+        let found = |chair: [f32; 3]| {
+            let classes: [(&[u16], &[f32]); 2] = [(&[7, 8], &chair), (&[9], &[0.9; 3])];
+            report(&truth, &object_of, 3, classes.into_iter(), 0.5)
+        };
         // Object 2 is half thing and half wall; thing 8 is a quarter of object 1 and half of object 2.
-        let whole = found(vec![0.0; 3]);
+        let whole = found([0.0; 3]);
         assert_eq!((whole.n_objects, whole.n_merged_objects, whole.n_split_things), (3, 1, 1));
         assert_eq!(whole.n_in_objects, [8, 10]);
         let recall = |n, n_at_25, n_at_50| Recall { n, n_at_25, n_at_50 };
-        let report = found(vec![0.9, 0.6, 0.1]);
+        let report = found([0.9, 0.6, 0.1]);
         assert_eq!(
             (report.any, report.of_words, report.best_of_words),
             (recall(2, 2, 1), recall(2, 2, 1), recall(2, 2, 1))
         );
-        let report = found(vec![0.4, 0.1, 0.8]);
+        let report = found([0.4, 0.1, 0.8]);
         assert_eq!((report.of_words, report.best_of_words), (recall(2, 1, 0), recall(2, 2, 1)));
-        let report = found(vec![0.1, 0.45, 0.48]);
+        let report = found([0.1, 0.45, 0.48]);
         assert_eq!((report.of_words, report.best_of_words), (recall(2, 0, 0), recall(2, 1, 0)));
     }
 }

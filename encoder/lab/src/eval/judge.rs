@@ -24,32 +24,8 @@ const MIN_ANSWER: usize = 10;
 const SUBSETS: [usize; 3] = [19, 15, 10];
 
 /// Negative queries: categories absent from most scenes. Those that a scene does have are left out.
-pub(super) const ABSENT: [&str; 24] = [
-    "elephant",
-    "airplane",
-    "boat",
-    "piano",
-    "guitar",
-    "horse",
-    "cat",
-    "bird",
-    "fish",
-    "snake",
-    "banana",
-    "pizza",
-    "train",
-    "helicopter",
-    "bathtub",
-    "toilet",
-    "shower",
-    "umbrella",
-    "bicycle",
-    "motorcycle",
-    "tent",
-    "ladder",
-    "tractor",
-    "traffic light",
-];
+pub(super) const ABSENT: &str = "elephant,airplane,boat,piano,guitar,horse,cat,bird,fish,snake,banana,pizza,train,helicopter,\
+                                 bathtub,toilet,shower,umbrella,bicycle,motorcycle,tent,ladder,tractor,traffic light";
 
 /// What is scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
@@ -157,8 +133,8 @@ pub(crate) fn judge(
     };
     let mut asker = Asker { reader, objects: objects.as_ref(), encoder, settings, unknown: BTreeMap::new() };
     let classes = asker.classes(truth)?;
-    let thresholds = Thresholds::of(reader, objects.as_ref(), settings);
-    let abstained = asker.abstained(truth, thresholds.of_gaussians)?;
+    let (threshold, of_objects) = thresholds(reader, objects.as_ref(), settings);
+    let abstained = asker.abstained(truth, threshold)?;
     let things = Things::of(truth, &classes);
     let whole = things.confusion(&classes, classes.len());
     let subset = |n: usize| {
@@ -167,7 +143,7 @@ pub(crate) fn judge(
         Subset { n_classes: n, miou: mean((0..n).map(iou)), macc: mean((0..n).map(accuracy)) }
     };
     let sizes = std::iter::once(classes.len()).chain(SUBSETS.into_iter().filter(|n| *n < classes.len()));
-    let of_class = |(c, class): (usize, &Class)| things.retrieval(c, class, &whole, thresholds.of_gaussians);
+    let of_class = |(c, class): (usize, &Class)| things.retrieval(c, class, &whole, threshold);
     let words: Vec<WordReport> = classes.iter().enumerate().map(of_class).collect();
     let is_unanswered = |(i, c): &&(usize, Option<usize>)| c.is_some() && classes[0].cosines[*i].is_nan();
     Ok(EvalReport {
@@ -175,12 +151,10 @@ pub(crate) fn judge(
         profile: settings.profile,
         kind: if objects.is_some() { EvalKind::Objects } else { EvalKind::Gaussians },
         instances: objects.as_ref().map(|objects| {
-            let ids: Vec<_> = classes.iter().map(|class| (class.word.clone(), class.ids.clone())).collect();
-            let scores: Vec<Vec<f32>> = classes.iter().map(|class| class.of_objects.clone()).collect();
-            let n_objects = objects.ids.len();
-            instances::report(truth, &objects.object_of, n_objects, &ids, &scores, thresholds.of_objects)
+            let classes = classes.iter().map(|class| (&class.ids[..], &class.of_objects[..]));
+            instances::report(truth, &objects.object_of, objects.ids.len(), classes, of_objects)
         }),
-        threshold: thresholds.of_gaussians,
+        threshold,
         multi_class: sizes.map(subset).collect(),
         mean_iou_at_threshold: mean(words.iter().map(|w| w.iou_at_threshold)),
         mean_average_precision: mean(words.iter().map(|w| w.average_precision)),
@@ -260,7 +234,7 @@ impl Asker<'_> {
             things.any(|t| t.category.contains(word) || t.words.iter().any(|w| w.contains(word)))
         };
         let mut abstained = [0, 0];
-        for word in ABSENT.into_iter().filter(|word| !is_present(word)) {
+        for word in ABSENT.split(',').filter(|word| !is_present(word)) {
             if let Some((cosines, _)) = self.score(word)? {
                 let n = cosines.iter().filter(|c| **c >= threshold).count();
                 abstained[0] += usize::from(n < MIN_ANSWER);
@@ -271,29 +245,24 @@ impl Asker<'_> {
     }
 }
 
-struct Thresholds {
-    of_gaussians: f32,
-    of_objects: f32,
-}
-
-impl Thresholds {
-    fn of(reader: &StoreReader, objects: Option<&PublishedObjects>, settings: &JudgeSettings) -> Self {
-        let record = &reader.manifest().encoder;
-        let of_scene = record.default_threshold;
-        let of_objects = match (objects, record.calibration) {
-            // A scene's own threshold lies three spreads above the mean of the scores, here those of objects.
-            (Some(objects), Some(_)) => {
-                let Calibration { score_mean, score_spread } = objects.calibration;
-                (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
-            }
-            _ => of_scene,
-        };
-        let of_gaussians = if objects.is_some() { query::mixed(of_scene, of_objects) } else { of_scene };
-        Self {
-            of_gaussians: settings.threshold.unwrap_or(of_gaussians),
-            of_objects: settings.threshold.unwrap_or(of_objects),
+/// Least scores of Gaussians and of objects that match.
+fn thresholds(
+    reader: &StoreReader,
+    objects: Option<&PublishedObjects>,
+    settings: &JudgeSettings,
+) -> (f32, f32) {
+    let record = &reader.manifest().encoder;
+    let of_scene = record.default_threshold;
+    let of_objects = match (objects, record.calibration) {
+        // A scene's own threshold lies three spreads above the mean of the scores, here those of objects.
+        (Some(objects), Some(_)) => {
+            let Calibration { score_mean, score_spread } = objects.calibration;
+            (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
         }
-    }
+        _ => of_scene,
+    };
+    let of_gaussians = if objects.is_some() { query::mixed(of_scene, of_objects) } else { of_scene };
+    (settings.threshold.unwrap_or(of_gaussians), settings.threshold.unwrap_or(of_objects))
 }
 
 /// The judged Gaussians: those of all things for retrieval, those of the queried categories for argmax.

@@ -7,14 +7,11 @@ pub(super) fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     if n_positive == 0.0 || n_negative == 0.0 {
         return None;
     }
-    let order = descending(scores);
     // Ranks from the worst; equal scores share their mean rank.
-    let (mut sum, mut i) = (0.0, 0);
-    while i < order.len() {
-        let same = order[i..].iter().take_while(|k| scores[**k] == scores[order[i]]).count();
-        let rank = order.len() as f64 - i as f64 - (same as f64 - 1.0) / 2.0;
-        sum += rank * order[i..i + same].iter().filter(|k| positive[**k]).count() as f64;
-        i += same;
+    let (mut sum, mut n_left) = (0.0, positive.len() as f64);
+    for (n, n_right) in equal_scores(scores, positive) {
+        sum += (n_left - (n - 1.0) / 2.0) * n_right;
+        n_left -= n;
     }
     Some((sum - n_positive * (n_positive + 1.0) / 2.0) / (n_positive * n_negative))
 }
@@ -26,22 +23,21 @@ pub(super) fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64
     if n_positive == 0.0 {
         return None;
     }
-    let order = descending(scores);
-    let (mut sum, mut found, mut i) = (0.0, 0.0, 0);
-    while i < order.len() {
-        let same = order[i..].iter().take_while(|k| scores[**k] == scores[order[i]]).count();
-        let more = order[i..i + same].iter().filter(|k| positive[**k]).count() as f64;
-        i += same;
-        found += more;
-        sum += more / n_positive * found / i as f64;
+    let (mut sum, mut found, mut n_found) = (0.0, 0.0, 0.0);
+    for (n, n_right) in equal_scores(scores, positive) {
+        found += n_right;
+        n_found += n;
+        sum += n_right / n_positive * found / n_found;
     }
     Some(sum)
 }
 
-fn descending(scores: &[f32]) -> Vec<usize> {
+/// Numbers of equal scores, best first, and of those that are positive.
+fn equal_scores(scores: &[f32], positive: &[bool]) -> Vec<(f64, f64)> {
     let mut order: Vec<usize> = (0..scores.len()).collect();
     order.sort_unstable_by(|a, b| scores[*b].total_cmp(&scores[*a]));
-    order
+    let counts = |same: &[usize]| (same.len() as f64, same.iter().filter(|k| positive[**k]).count() as f64);
+    order.chunk_by(|a, b| scores[*a] == scores[*b]).map(counts).collect()
 }
 
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -4,7 +4,7 @@
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Error, Result, anyhow};
+use anyhow::{Context, Result, bail};
 use glam::DVec3;
 use serde_json::Value;
 use slag_common::Gaussians;
@@ -40,8 +40,10 @@ pub fn write(
     let mut source = Source::read(source)?;
     if u64::from(n_views) > u64::from(n_copies) * source.frames.len() as u64 {
         let n = source.frames.len();
-        return Err(source
-            .unfit(format!("it has {n} photos, too few for {n_views} of {n_copies} copies; ask for fewer")));
+        bail!(
+            "{}: it has {n} photos, too few for {n_views} of {n_copies} copies; ask for fewer",
+            source.folder.display()
+        );
     }
     let grid = Grid::of(&source.gaussians, n_copies);
     fs_err::create_dir_all(folder.join("images"))?;
@@ -92,22 +94,18 @@ struct Source {
 
 impl Source {
     fn read(folder: &Path) -> Result<Self> {
-        let unfit = |what: &str| anyhow!("{}: {what}", folder.display());
+        let shown = folder.display();
         let splats = ["scene.ply", "point_cloud.ply"].map(|name| folder.join(name));
         let splat = splats.into_iter().find(|path| path.exists());
-        let splat = splat.ok_or_else(|| unfit("no scene.ply or point_cloud.ply"))?;
+        let splat = splat.with_context(|| format!("{shown}: no scene.ply or point_cloud.ply"))?;
         let gaussians = splat::read(&splat, &ReadOptions { with_sh_rest: true })?;
         let poses = folder.join("transforms.json");
         let poses: Value =
             serde_json::from_slice(&fs_err::read(&poses)?).with_context(|| poses.display().to_string())?;
         let frames = poses["frames"].as_array().filter(|frames| !frames.is_empty());
-        let frames = frames.ok_or_else(|| unfit("transforms.json has no frames"))?.clone();
+        let frames = frames.with_context(|| format!("{shown}: transforms.json has no frames"))?.clone();
         let masks = Some(folder.join("gt/masks")).filter(|masks| masks.is_dir());
         Ok(Self { folder: folder.to_owned(), gaussians, poses, frames, masks })
-    }
-
-    fn unfit(&self, what: String) -> Error {
-        anyhow!("{}: {what}", self.folder.display())
     }
 
     /// Writes the Gaussians of all copies; returns their number.
@@ -139,7 +137,8 @@ impl Source {
         let at = (view - first) * self.frames.len() as u64 / of_copy + copy * 7;
         let mut frame = self.frames[at as usize % self.frames.len()].clone();
         let path = frame["file_path"].as_str();
-        let photo = self.folder.join(path.ok_or_else(|| self.unfit("a frame without file_path".into()))?);
+        let shown = self.folder.display();
+        let photo = self.folder.join(path.with_context(|| format!("{shown}: a frame without file_path"))?);
         let (stem, suffix) = (file_part(photo.file_stem()), file_part(photo.extension()));
         let name = format!("c{copy:04}_{stem}");
         link(&photo, &folder.join(format!("images/{name}.{suffix}")))?;
@@ -149,9 +148,8 @@ impl Source {
         frame["file_path"] = format!("images/{name}.{suffix}").into();
         for (axis, by) in grid.offset(copy as u32).to_array().into_iter().enumerate() {
             let cell = &mut frame["transform_matrix"][axis][3];
-            let value = cell.as_f64();
-            let value = value.ok_or_else(|| self.unfit("a transform_matrix that is not 4x4".into()))?;
-            *cell = (value + by).into();
+            let wrong = || format!("{shown}: a transform_matrix that is not 4x4");
+            *cell = (cell.as_f64().with_context(wrong)? + by).into();
         }
         if let Some(frame) = frame.as_object_mut() {
             frame.remove("mask_instance_path");

@@ -13,7 +13,7 @@ use slag_models::preprocess::{Filter, Preprocess, Resize};
 
 use super::compose::{Layout, looking, pinhole};
 use super::grammar::{NOUNS, Noun};
-use super::paint::{Colour, Material};
+use super::paint::{Colour, Material, word};
 use super::render::{NOTHING, Photo, Solids};
 use slag_encoder::embed;
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
@@ -62,7 +62,7 @@ pub struct Label {
 /// A hash of the words decides, so new nouns do not affect other pairs.
 pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
     // FNV-1a (Fowler, Noll, Vo).
-    let words = noun.name.bytes().chain(colour.word().bytes());
+    let words = noun.name.bytes().chain(word(colour).into_bytes());
     let hash =
         words.fold(0xcbf2_9ce4_8422_2325, |h: u64, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
     // A noun with few colours cannot spare any.

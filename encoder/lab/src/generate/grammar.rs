@@ -218,14 +218,14 @@ impl Noun {
             ["paint", name] => {
                 let (materials, colours) =
                     rest.split_once('|').ok_or("no `|`, expected MATERIALS | COLOURS")?;
-                let materials = list(materials).map(Material::parse).collect::<Result<_, _>>()?;
+                let materials = list(materials).map(known).collect::<Result<_, _>>()?;
                 let mut rule =
                     PaintRule { name: name.to_owned(), materials, colours: Vec::new(), or_same: false };
                 for colour in list(colours) {
                     match colour {
-                        "any" => rule.colours.extend(Colour::ALL),
+                        "any" => rule.colours.extend(Colour::value_variants()),
                         "same" if !self.paints.is_empty() => rule.or_same = true,
-                        colour => rule.colours.push(Colour::parse(colour)?),
+                        colour => rule.colours.push(known(colour)?),
                     }
                 }
                 self.paints.push(rule);
@@ -353,11 +353,16 @@ impl Noun {
 
 fn found(text: &str) -> Result<(SceneKind, Place), String> {
     let (scene, place) = text.split_once(' ').ok_or_else(|| format!("`{text}`, expected SCENE PLACE"))?;
-    let scene = SceneKind::from_str(scene, false)
-        .map_err(|_| format!("`{scene}`, expected room, yard, street or warehouse"))?;
-    let place = Place::from_str(place.trim(), false)
-        .map_err(|_| format!("`{place}`, expected floor, wall, hung, on, row or shell"))?;
-    Ok((scene, place))
+    Ok((known(scene)?, known(place.trim())?))
+}
+
+/// The value of this name.
+fn known<T: ValueEnum>(name: &str) -> Result<T, String> {
+    T::from_str(name, false).map_err(|_| {
+        let names = T::value_variants().iter().filter_map(ValueEnum::to_possible_value);
+        let names: Vec<String> = names.map(|value| value.get_name().to_owned()).collect();
+        format!("`{name}`, expected one of: {}", names.join(", "))
+    })
 }
 
 impl PartRule {

@@ -1,83 +1,65 @@
 //! Looks of surfaces: named colours, and materials.
 
+use clap::ValueEnum;
 use glam::DVec3;
 use serde::Serialize;
-
 use slag_math::random::Xorshift;
 
-macro_rules! named {
-    ($(#[$doc:meta])* $name:ident: $($(#[$variant_doc:meta])* $variant:ident $text:literal),+ $(,)?) => {
-        $(#[$doc])*
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
-        #[serde(rename_all = "lowercase")]
-        pub enum $name {
-            $($(#[$variant_doc])* $variant),+
-        }
-
-        impl $name {
-            pub const ALL: &[Self] = &[$(Self::$variant),+];
-
-            pub fn word(self) -> &'static str {
-                match self { $(Self::$variant => $text),+ }
-            }
-
-            pub fn parse(word: &str) -> Result<Self, String> {
-                Self::ALL.iter().copied().find(|known| known.word() == word).ok_or_else(|| {
-                    format!("`{word}`, expected one of: {}", Self::ALL.iter().map(|k| k.word()).collect::<Vec<_>>().join(", "))
-                })
-            }
-        }
-    };
+/// The eleven basic colour terms of English (Berlin and Kay 1969).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Colour {
+    Black,
+    White,
+    Grey,
+    Red,
+    Green,
+    Blue,
+    Yellow,
+    Orange,
+    Brown,
+    Purple,
+    Pink,
 }
 
-named! {
-    /// The eleven basic colour terms of English (Berlin and Kay 1969).
-    Colour:
-    Black "black",
-    White "white",
-    Grey "grey",
-    Red "red",
-    Green "green",
-    Blue "blue",
-    Yellow "yellow",
-    Orange "orange",
-    Brown "brown",
-    Purple "purple",
-    Pink "pink",
-}
-
-named! {
-    Material:
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Material {
     /// Long grain along the part's longest edge.
-    Wood "wood",
+    Wood,
     /// Brushed, with a strong highlight.
-    Metal "metal",
+    Metal,
     /// Even, with a highlight.
-    Plastic "plastic",
+    Plastic,
     /// Fine weave, no highlight.
-    Fabric "fabric",
+    Fabric,
     /// Dark patches, a soft highlight.
-    Leather "leather",
+    Leather,
     /// Mottled.
-    Stone "stone",
+    Stone,
     /// Courses of bricks with mortar.
-    Brick "brick",
+    Brick,
     /// Smooth and glossy.
-    Ceramic "ceramic",
+    Ceramic,
     /// Glossy, with a reflected streak.
-    Glass "glass",
+    Glass,
     /// Even and dull.
-    Paper "paper",
+    Paper,
     /// Even, dull, rough.
-    Rubber "rubber",
+    Rubber,
     /// Coarse light and dark.
-    Leaf "leaf",
+    Leaf,
     /// Even, with faint patches.
-    Skin "skin",
+    Skin,
     /// Even, with faint unevenness.
-    Plaster "plaster",
+    Plaster,
     /// Squares with joints.
-    Tile "tile",
+    Tile,
+}
+
+/// The word for a colour or a material.
+pub fn word(of: impl std::fmt::Debug) -> String {
+    format!("{of:?}").to_lowercase()
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -202,7 +184,7 @@ mod tests {
     #[test]
     fn shades_keep_to_their_names() {
         let mut random = Xorshift::new(5);
-        for colour in Colour::ALL {
+        for colour in Colour::value_variants() {
             for _ in 0..100 {
                 let rgb = colour.shade(&mut random);
                 let (low, high) =

@@ -13,6 +13,7 @@ use slag_math::random::Xorshift;
 
 use super::compose::{Layout, Walk, photo_intrinsics};
 use super::grammar::{NOUNS, SceneKind};
+use super::paint::word;
 use super::render::NOTHING;
 
 /// Distance between surface Gaussians, relative to the thing's radius.
@@ -45,8 +46,8 @@ pub struct TrueObject {
     pub words: Vec<String>,
     pub kinds: Vec<String>,
     /// Its colours, the main one first.
-    pub colours: Vec<&'static str>,
-    pub material: &'static str,
+    pub colours: Vec<String>,
+    pub material: String,
     /// Whether it is background, such as floor and walls.
     pub background: bool,
     pub centre: DVec3,
@@ -60,7 +61,6 @@ pub struct TrueObject {
 pub struct WrittenScene {
     pub scene: PathBuf,
     pub views: PathBuf,
-    pub truth: PathBuf,
 }
 
 impl Scene {
@@ -97,8 +97,8 @@ impl Scene {
                 category: noun.name.clone(),
                 words: noun.words.clone(),
                 kinds: noun.kinds.clone(),
-                colours: placed.object.colours.iter().map(|colour| colour.word()).collect(),
-                material: placed.object.paint.material.word(),
+                colours: placed.object.colours.iter().map(word).collect(),
+                material: word(placed.object.paint.material),
                 background: placed.shell,
                 centre: placed.bounds.centre(),
                 aabb_min: placed.bounds.min,
@@ -142,7 +142,7 @@ impl Scene {
         write_json(&truth.join("instances.json"), &instances)?;
         let ids = &self.id_of_gaussian;
         npy::write_file(&truth.join("gaussian_instance.npy"), &[ids.len()], ids)?;
-        Ok(WrittenScene { scene, views, truth })
+        Ok(WrittenScene { scene, views })
     }
 
     /// Returns the number of pixels that show each object.
