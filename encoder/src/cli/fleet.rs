@@ -39,7 +39,7 @@ impl CoordinatorArgs {
         progress: &dyn Progress,
         cancel: &AtomicBool,
     ) -> Result<EncodeSummary> {
-        let queue = self.queue.url.is_some().then(|| self.queue.clone());
+        let queue = self.queue.fleet.is_some().then(|| self.queue.clone());
         match &self.blobs {
             Some(url) => {
                 let coordinator = Coordinator::new(open_bucket(url)?, queue);
@@ -94,7 +94,7 @@ pub struct WorkerArgs {
 }
 
 pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
-    let dispatch = match (&args.queue.url, args.index, args.of) {
+    let dispatch = match (&args.queue.fleet, args.index, args.of) {
         (Some(_), _, _) => Dispatch::Queue(args.queue.clone()),
         (None, Some(index), Some(of)) if index < of => {
             Dispatch::Share { index: index as usize, of: of as usize, help_after: args.help_after }

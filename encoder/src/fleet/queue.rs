@@ -36,8 +36,8 @@ const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 #[command(next_help_heading = "Fleet")]
 pub(crate) struct QueueSettings {
     /// NATS server with JetStream that hands out the work; without it, workers have shares. TLS with tls://.
-    #[arg(id = "fleet", long, value_name = "nats://HOST:PORT", hide_short_help = true)]
-    pub(crate) url: Option<String>,
+    #[arg(long, value_name = "nats://HOST:PORT", hide_short_help = true)]
+    pub(crate) fleet: Option<String>,
     /// Credentials file for the NATS server.
     #[arg(long, value_name = "FILE", requires = "fleet", env = "NATS_CREDS", hide_short_help = true)]
     nats_credentials: Option<PathBuf>,
@@ -69,7 +69,7 @@ pub(crate) fn parse_period(text: &str) -> Result<Duration, String> {
 impl QueueSettings {
     /// One address, or several with commas.
     fn url(&self) -> &str {
-        self.url.as_deref().unwrap_or_default()
+        self.fleet.as_deref().unwrap_or_default()
     }
 
     async fn connect(&self) -> Result<Context, EncodeError> {
