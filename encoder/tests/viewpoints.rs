@@ -142,6 +142,61 @@ fn labelled_scenes_are_never_upside_down() {
     }
 }
 
+/// A yard of 12 x 12 with crates; a thirteenth of its Gaussians is a sky 300 away, which counts for nothing.
+#[test]
+fn a_sky_changes_no_plan() {
+    let mut yard = Gaussians::default();
+    add_rectangle(&mut yard, DVec3::ZERO, DVec3::X * 12.0, DVec3::Y * 12.0);
+    for at in [DVec3::new(2.0, 3.0, 0.0), DVec3::new(8.0, 2.0, 0.0), DVec3::new(5.0, 9.0, 0.0)] {
+        let sides = [DVec3::X, DVec3::Y].map(|side| side * 1.2);
+        add_rectangle(&mut yard, at + DVec3::Z, sides[0], sides[1]);
+        for (corner, side) in
+            [(at, sides[0]), (at, sides[1]), (at + sides[0], sides[1]), (at + sides[1], sides[0])]
+        {
+            add_rectangle(&mut yard, corner, side, DVec3::Z);
+        }
+    }
+    let n = yard.len();
+    let mut under_a_sky = yard.clone();
+    let mut random = Random::new(31);
+    for _ in 0..n / 12 {
+        let direction = DVec3::from([0; 3].map(|_| random.between(-1.0, 1.0))).normalize();
+        under_a_sky.means_in_world.push(direction * 300.0);
+        under_a_sky.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        under_a_sky.scales.push([9.0; 3]);
+        under_a_sky.opacities.push(0.9);
+        under_a_sky.sh_dc.push([0.1; 3]);
+    }
+    let plan = plan_of(&under_a_sky, None).unwrap();
+    assert_eq!((plan.kind, plan.views.len()), (SceneKind::Outdoor, 16));
+    assert!(plan.up_in_world.dot(DVec3::Z) > 0.9998, "{:?}", plan.up_in_world);
+    for view in &plan.views {
+        let at = view.camera_from_world.inverse().translation;
+        assert!(
+            (0.1..3.0).contains(&at.z) && at.truncate().distance(glam::DVec2::splat(6.0)) < 10.0,
+            "{at:?}"
+        );
+    }
+}
+
+/// A room above another: half the height of the house is a floor.
+#[test]
+fn both_storeys_of_a_house_are_seen() {
+    let (low, mut house) = (room(), room());
+    let high = moved(&low, DQuat::IDENTITY, 1.0, DVec3::Z * 2.8);
+    house.means_in_world.extend(high.means_in_world);
+    house.rotations_wxyz.extend(high.rotations_wxyz);
+    house.scales.extend(high.scales);
+    house.opacities.extend(high.opacities);
+    house.sh_dc.extend(high.sh_dc);
+    let plan = plan_of(&house, None).unwrap();
+    assert!(plan.up_in_world.dot(DVec3::Z) > 0.9998, "{:?}", plan.up_in_world);
+    let heights: Vec<f64> =
+        plan.views.iter().map(|view| view.camera_from_world.inverse().translation.z).collect();
+    let is_in = |floor: f64| heights.iter().filter(|z| (floor + 0.4..floor + 2.2).contains(*z)).count();
+    assert!(is_in(0.0) > 4 && is_in(2.8) > 4 && is_in(0.0) + is_in(2.8) == 16, "{heights:?}");
+}
+
 /// A ball alone has no upward direction: it is seen from all sides, with the file's.
 #[test]
 fn a_thing_by_itself_is_seen_from_around() {

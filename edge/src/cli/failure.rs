@@ -69,7 +69,9 @@ impl Failure {
             }
         };
         if !is_told {
-            let _ = writeln!(io::stderr(), "error: {}", visible(&detail));
+            // Its own lines stay lines; names within them may hold anything else.
+            let lines: Vec<String> = detail.lines().map(visible).collect();
+            let _ = writeln!(io::stderr(), "error: {}", lines.join("\n"));
         }
         self.exit
     }

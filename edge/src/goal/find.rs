@@ -36,7 +36,7 @@ pub fn find(on_board: &OnBoard, request: &GoalRequest, budget: &Budget) -> Resul
     let Some(start) = seen.start(near, request.robot.radius_m) else {
         let detail = format!(
             "within {START_M} m of [{:.2}, {:.2}, {:.2}], where the robot is taken to be, no known ground at that height is {} m \
-             clear",
+             clear; give a place on the ground as near (--near X,Y,Z)",
             near.x, near.y, near.z, request.robot.radius_m
         );
         reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });

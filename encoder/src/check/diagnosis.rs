@@ -431,7 +431,7 @@ impl fmt::Display for CheckReport {
             None if self.mean_psnr_db < ALIKE_DB => writeln!(
                 f,
                 "the drawings match the photos, at less than the {ALIKE_DB} dB of a good splat: a lens model or poses that are \
-                 a little wrong look so, and a short training; --out DIR shows where"
+                 a little wrong look so, and a short training; the pictures of --out show where"
             ),
             None => writeln!(f, "the drawings match the photos"),
             Some(diagnosis) => {

@@ -74,13 +74,14 @@ fn checked(args: &CheckArgs) -> Result<(CheckReport, bool)> {
     args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;
     let mut set = poses::read(poses, input.images.as_deref())?;
     let mut notes = std::mem::take(&mut set.notes);
+    match ingest::n_drawn(&set.views) {
+        0 => {}
+        n => notes.push(format!(
+            "{n} of the images are no photos: they were drawn from a splat, so that they fit says little"
+        )),
+    }
     let frame = match ingest::drawn_from(poses) {
-        Some(splat) => {
-            notes.push(format!(
-                "the images are no photos: they were drawn from {splat}, so that they fit says little"
-            ));
-            None
-        }
+        Some(_) => None,
         None => ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?,
     };
     let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;

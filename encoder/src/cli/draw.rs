@@ -17,6 +17,7 @@ use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::raster::{RasterView, Rasterizer, check_near_plane};
+use crate::store::remove_files;
 use crate::viewpoints::{self, DEFAULT_N_VIEWS, DrawnView, ViewpointSettings};
 
 const PLAN_EXAMPLES: &str = "Examples:\n\
@@ -104,6 +105,8 @@ pub(super) fn plan(args: &PlanArgs, progress: &dyn Progress, json: bool) -> Resu
     let plan = viewpoints::plan(&scene, &devices, &settings, default_memory_bytes(), &false.into())?;
     let views = viewpoints::views_of(&plan);
     let about = json!({ "kind": plan.kind, "up": plan.up_in_world });
+    // Drawings of another plan.
+    remove_files(&args.drawing.out.join("images"), |name| name.starts_with("drawn-"))?;
     viewpoints::draw_sharpened(&args.drawing.out, &views, &mut scene, &devices, &name, about, progress)?;
     let poses = args.drawing.out.join(viewpoints::POSES_FILE);
     print(json, &json!({ "plan": plan, "poses": poses }), format!("{plan}\n{}\n", poses.display()))?;
@@ -122,10 +125,19 @@ pub(super) fn draw(args: &DrawArgs, progress: &dyn Progress, json: bool) -> Resu
     let out = &args.drawing.out;
     check_near_plane(&scene, &views.iter().map(|view| view.view).collect::<Vec<_>>())?;
     let scene = devices.load(&scene)?;
-    viewpoints::draw(out, &mut views, scene.as_ref(), &name, args.depth, progress)?;
+    let n_empty = viewpoints::draw(out, &mut views, scene.as_ref(), &name, args.depth, progress)?;
     let poses = out.join(viewpoints::POSES_FILE);
     let report = json!({ "n_views": views.len(), "poses": poses });
     print(json, &report, format!("{} views in {}\n", views.len(), poses.display()))?;
+    if n_empty == views.len() {
+        return Err(anyhow!(
+            "none of the {n_empty} views shows anything of {name}; do the poses belong to it?"
+        ));
+    }
+    if n_empty > 0 {
+        tracing::warn!("{n_empty} of {} views show nothing of {name}", views.len());
+        return Ok(Exit::Partly);
+    }
     Ok(Exit::Done)
 }
 

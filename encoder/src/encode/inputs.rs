@@ -45,7 +45,6 @@ pub(crate) struct Inputs {
     /// Views without a photo, in the same order.
     pub(super) missing: Vec<SkippedView>,
     pub(super) geo_reference: Option<GeoReference>,
-    pub(super) n_drawn: usize,
 }
 
 impl Inputs {
@@ -56,7 +55,7 @@ impl Inputs {
         let options = ReadOptions { with_sh_rest: false };
         let mut scene = context.time("read", || splat::read(&inputs.scene, &options))?;
         inputs.activated.undo(&mut scene);
-        let (set, n_drawn) = read_views(inputs)?;
+        let set = read_views(inputs)?;
         let damaged = set.damaged;
         // Drawings share the splat's world.
         if ingest::drawn_from(&inputs.views).is_none() {
@@ -101,7 +100,7 @@ impl Inputs {
         }
         let stands = || context.install(|| Standing::find(&scene, &views));
         let standing = Arc::new(context.time("ground", stands));
-        Ok(Self { scene, split, standing, views, missing, geo_reference, n_drawn })
+        Ok(Self { scene, split, standing, views, missing, geo_reference })
     }
 }
 
@@ -158,32 +157,33 @@ pub(crate) fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), Enc
     if let Some(planned) = &inputs.planned {
         return Ok((planned.n_views, scene.len()));
     }
-    let views = read_views(inputs)?.0.views;
+    let views = read_views(inputs)?.views;
     Ok((views.len() - ingest::missing_images(&views).len(), scene.len()))
 }
 
-/// Reads the poses of every nth frame, and counts the drawings.
-fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
+/// Reads the poses of every nth photo, and those of further files.
+fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
     let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;
-    let mut n_drawn = ingest::drawn_from(&inputs.views).map_or(0, |_| set.views.len());
-    for path in &inputs.added {
-        n_drawn += add_views(&mut set, &inputs.views, path)?;
-    }
+    // Planned views are few, and each shows what others do not.
+    let (drawn, photos): (Vec<_>, Vec<_>) =
+        inputs.added.iter().partition(|path| ingest::drawn_from(path).is_some());
+    photos.into_iter().try_for_each(|path| add_views(&mut set, &inputs.views, path))?;
     if let Some(n) = inputs.every {
         let n_frames = set.views.len() + set.without_pose.len();
         set = set.every(n);
         tracing::info!("every {n}th frame: {} of {n_frames}", set.views.len() + set.without_pose.len());
     }
+    drawn.into_iter().try_for_each(|path| add_views(&mut set, &inputs.views, path))?;
     set.notes.iter().for_each(|note| tracing::warn!("{note}"));
     if let Some(left_out) = set.left_out() {
         tracing::info!("{left_out}");
     }
     drop_views(&mut set.views, &inputs.dropped)?;
-    Ok((set, n_drawn))
+    Ok(set)
 }
 
-/// Adds the views of another poses file; returns the number of drawings. `first`: the first file, for errors.
-fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, EncodeError> {
+/// Adds the views of another poses file. `first`: the first file, for errors.
+fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<(), EncodeError> {
     let added = poses::read(path, None)?;
     let (shown, first) = (path.display(), first.display());
     if added.applied != set.applied {
@@ -198,13 +198,12 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, Enco
             view.name
         )));
     }
-    let n_drawn = ingest::drawn_from(path).map_or(0, |_| added.views.len());
     set.views.extend(added.views);
     set.views.sort_by(|a, b| a.name.cmp(&b.name));
     set.without_pose.extend(added.without_pose);
     set.without_pose.sort();
     set.damaged.extend(added.damaged);
-    Ok(n_drawn)
+    Ok(())
 }
 
 fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError> {
@@ -476,7 +475,6 @@ mod tests {
             views: vec![view],
             missing: Vec::new(),
             geo_reference: None,
-            n_drawn: 0,
         }
     }
 

@@ -95,7 +95,8 @@ pub(super) fn plan<'a>(
     let lost_views = lost_views(store, of_scene)?;
     let job = Job::open(store, of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
-    let n_unlike = context.install(|| unlike(inputs, scene.as_ref()));
+    let is_drawn_now = settings.inputs.planned.is_some();
+    let n_unlike = if is_drawn_now { [0; 2] } else { context.install(|| unlike(inputs, scene.as_ref())) };
     let start = Instant::now();
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
@@ -182,9 +183,6 @@ fn lost(reader: &StoreReader, settings: &EncodeSettings, inputs: &Inputs) -> Vec
 fn unlike(inputs: &Inputs, scene: &dyn LoadedScene) -> [usize; 2] {
     let n = inputs.views.len();
     let mut counts = [0; 2];
-    if inputs.n_drawn == n {
-        return counts;
-    }
     for view in (0..n.min(N_COMPARED)).map(|i| &inputs.views[i * n / n.min(N_COMPARED)]) {
         // Photos that cannot be read are told later, each by its name.
         let Ok(photo) = ingest::load_image(view) else { continue };
@@ -336,7 +334,6 @@ mod tests {
             views: Vec::new(),
             missing: Vec::new(),
             geo_reference: None,
-            n_drawn: 0,
         };
         let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
         let engines = Engines::new(&models, &session, &CpuRasterizer);

@@ -15,6 +15,7 @@ use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary, LeftOut};
 use super::settings::Masks;
 use super::views::{DoneViews, Executor};
+use crate::ingest;
 use crate::store::{ModelsRecord, Store};
 
 /// Publishes the built cells, ends the job and returns the summary.
@@ -153,7 +154,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         n_rejected: manifest.n_rejected,
         n_views: views.used.len(),
         n_views_with_photo: plan.inputs.views.len(),
-        n_views_drawn: plan.inputs.n_drawn,
+        n_views_drawn: ingest::n_drawn(views.used.iter().copied()),
         view_order: plan.settings.run.view_order,
         coverage: views.coverage,
         coverage_secs: plan.coverage_secs,

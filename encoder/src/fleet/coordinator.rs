@@ -122,7 +122,7 @@ impl ViewsInWork<'_> {
             objects::unpack_view(&bytes).map_err(|e| damaged(self.bucket, &key, e))?;
         durable::write(&plan.job.outlines_path(name), &outlines)?;
         durable::write(&plan.job.contributions_path(name), &contributions)?;
-        Ok(plan.job.mark_done(name, record)?)
+        plan.job.mark_done(name, record)
     }
 
     /// Leaves out views that workers could not do; with `is_strict`, fails at the first.

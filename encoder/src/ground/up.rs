@@ -23,8 +23,8 @@ const MAX_SPREAD: f64 = 0.6;
 const MIN_OPACITY: f32 = 0.3;
 /// The median height must lie this far below the middle, relative to the height, to tell up from down.
 const MIN_SKEW: f64 = 0.03;
-/// Distance of a sky's Gaussians from the middle, relative to that of nine tenths. Uniform scenes end at 1.1 times it.
-const FAR: f64 = 4.0;
+/// Distance of a sky's Gaussians from the middle, relative to the median one: a level scene ends at 1.4 times it.
+const FAR: f64 = 6.0;
 /// Trimmed share at either end of an extent.
 pub(crate) const TRIMMED: f64 = 0.02;
 /// Default without evidence: cameras of photos have y down, and so have most files.
@@ -67,7 +67,7 @@ pub(crate) fn find(scene: &Gaussians) -> Up {
     }
 }
 
-/// Gaussians of surfaces, without those of a sky: far beyond nine tenths of the others, where no drawing shows detail.
+/// Gaussians of surfaces, without those of a sky, which are far beyond the others.
 pub(crate) fn solid(scene: &Gaussians) -> Vec<u32> {
     let mut solid: Vec<u32> =
         (0..scene.len() as u32).filter(|i| scene.opacities[*i as usize] >= MIN_OPACITY).collect();
@@ -77,12 +77,8 @@ pub(crate) fn solid(scene: &Gaussians) -> Vec<u32> {
         median(&mut along).unwrap_or(0.0)
     }));
     let mut distances: Vec<f64> = solid.iter().map(|i| place(i).distance(centre)).collect();
-    if !distances.is_empty() {
-        let nth = distances.len() * 9 / 10;
-        let (_, most, _) = distances.select_nth_unstable_by(nth, f64::total_cmp);
-        let far = FAR * *most;
-        solid.retain(|i| place(i).distance(centre) <= far);
-    }
+    let far = FAR * median(&mut distances).unwrap_or(0.0);
+    solid.retain(|i| place(i).distance(centre) <= far);
     solid
 }
 

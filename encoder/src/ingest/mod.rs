@@ -2,6 +2,7 @@
 
 mod splat_frame;
 
+use std::collections::BTreeMap;
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -121,6 +122,18 @@ pub fn drawn_from(poses: &Path) -> Option<String> {
     let bytes = is_json.then(|| fs_err::read(path).ok())??;
     // The reader of poses reports malformed files.
     serde_json::from_str::<Drawn>(files::text_of(&bytes).ok()?).ok().map(|drawn| drawn.drawn_from)
+}
+
+/// Number of views whose image is a drawing: it lies in the `images/` beside a poses file of `plan` or `draw`.
+pub(crate) fn n_drawn<'a>(views: impl IntoIterator<Item = &'a View>) -> usize {
+    let mut is_drawn_in: BTreeMap<&'a Path, bool> = BTreeMap::new();
+    let mut is_drawn = |view: &&'a View| {
+        let images = view.image_path.ancestors().find(|path| path.ends_with("images"));
+        let folder = images.and_then(Path::parent);
+        folder
+            .is_some_and(|folder| *is_drawn_in.entry(folder).or_insert_with(|| drawn_from(folder).is_some()))
+    };
+    views.into_iter().filter(|view| is_drawn(view)).count()
 }
 
 pub(crate) fn hash_file(path: &Path) -> io::Result<Hash32> {

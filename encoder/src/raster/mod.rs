@@ -90,7 +90,7 @@ pub enum RasterError {
     Region { pixel: usize, found: u32, n_regions: u32 },
     #[error(
         "the Gaussians before the cameras are {depth:.1e} units away (median), and {:.0} % nearer than {NEAR_Z}, where none \
-         is drawn; multiply the positions of poses and splat, and the splat's scales, by {factor}",
+         is drawn; enlarge poses and splat {factor} times: their positions, and the Gaussians' sizes (a PLY has logarithms of them)",
         cut_share * 100.0
     )]
     NearPlane { depth: f64, cut_share: f64, factor: f64 },

@@ -3,6 +3,7 @@
 use std::f32::consts::SQRT_2;
 use std::io::{self, BufReader, Cursor};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{DAffine3, DMat3, DVec3};
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
@@ -62,8 +63,8 @@ pub(crate) fn check_folder(folder: &Path) -> Result<(), ViewpointError> {
     }
 }
 
-/// Draws views into `images/` of a folder, `with_depth` also their arrays, then writes the poses file. `drawn_from`: the
-/// splat, as the poses file names it.
+/// Draws views into `images/` of a folder, `with_depth` also their arrays, then writes the poses file. Returns the
+/// number of views that show nothing. `drawn_from`: the splat, as the poses file names it.
 pub fn draw(
     folder: &Path,
     views: &mut [DrawnView],
@@ -71,9 +72,12 @@ pub fn draw(
     drawn_from: &str,
     with_depth: bool,
     progress: &dyn Progress,
-) -> Result<(), ViewpointError> {
+) -> Result<usize, ViewpointError> {
+    let n_empty = AtomicUsize::new(0);
     begin(folder, drawn_from)?;
     draw_images(folder, views, scene, progress, |view, drawing, _| {
+        let is_empty = drawing.coverage.iter().all(|opacity| *opacity < 1.0 / 255.0);
+        n_empty.fetch_add(usize::from(is_empty), Ordering::Relaxed);
         if with_depth {
             let shape = [drawing.height_px as usize, drawing.width_px as usize];
             for (of, values) in [("depth", &drawing.depth), ("coverage", &drawing.coverage)] {
@@ -91,7 +95,8 @@ pub fn draw(
             extend(&mut view.about, json!({ "depth_file_path": depth, "coverage_file_path": coverage }));
         }
     }
-    write_poses(folder, views, drawn_from, json!({}))
+    write_poses(folder, views, drawn_from, json!({}))?;
+    Ok(n_empty.into_inner())
 }
 
 /// Of a view's array of 32-bit floats, `[height][width]`, below the folder.

@@ -1,5 +1,6 @@
 //! Where drawings could be made, and a small drawing of each: can it be trusted, and which Gaussians does it show?
 
+use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
 
 use glam::{DAffine3, DMat3, DVec3};
@@ -142,6 +143,8 @@ const N_HEADINGS: usize = 8;
 const INDOOR: [(f64, f64); 2] = [(0.4, 0.05), (0.6, 0.25)];
 /// Free distance around a camera, as a share of the room's height.
 const CLEARANCE: f64 = 0.12;
+/// Least height of a storey, as a share of the house's.
+const MIN_STOREY: f64 = 0.2;
 /// Heights of cameras above the ground, as shares of the scene's width, and how far they look down, radians.
 const OUTDOOR: [(f64, f64); 3] = [(0.03, 0.05), (0.06, 0.15), (0.12, 0.4)];
 /// Rings around an object: elevation, radians, and distance as a share of the one at which it fills the image.
@@ -167,12 +170,33 @@ pub(super) fn kind_of(space: &Space) -> SceneKind {
     if is_indoor { SceneKind::Indoor } else { SceneKind::Outdoor }
 }
 
+/// Whether rooms hang from their floors: things stand on floors, so ceilings have the more even heights.
+pub(super) fn is_upside_down(space: &Space) -> bool {
+    let (mut n_low, mut n_high) = (BTreeMap::<i64, f64>::new(), BTreeMap::<i64, f64>::new());
+    for (x, y) in space.lattice(2.0 * VOXEL) {
+        let column: Vec<f64> = space.column(x, y).collect();
+        for pair in column.windows(2).filter(|pair| pair[1] - pair[0] > MIN_STOREY * 2.0 * space.half.z) {
+            let number = |z: f64| (z / VOXEL).round() as i64;
+            *n_low.entry(number(pair[0])).or_default() += 1.0;
+            *n_high.entry(number(pair[1])).or_default() += 1.0;
+        }
+    }
+    // Both have as many ends, so their squares tell which lie at fewer heights.
+    let evenness = |n: &BTreeMap<i64, f64>| n.values().map(|n| n * n).sum::<f64>();
+    evenness(&n_low) > evenness(&n_high)
+}
+
 pub(super) fn of(kind: SceneKind, space: &Space) -> Vec<DAffine3> {
     match kind {
         SceneKind::Indoor => standing(space, INDOOR.len(), indoor_places),
         SceneKind::Outdoor => standing(space, OUTDOOR.len(), outdoor_places),
         SceneKind::Object => rings(space),
     }
+}
+
+/// Cameras between the floors of a house, where half its height is a floor.
+pub(super) fn of_storeys(space: &Space) -> Vec<DAffine3> {
+    standing(space, 2 * INDOOR.len(), storey_places)
 }
 
 /// Cameras with all headings at the places of the finest lattice that has few enough.
@@ -212,6 +236,18 @@ fn indoor_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
         above && below
     };
     places.filter(|(at, _)| is_in_room(*at) && space.is_clear(*at, (CLEARANCE * height).max(VOXEL))).collect()
+}
+
+/// Free places between what lies above each other, with how far cameras look down.
+fn storey_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
+    let column: Vec<f64> = space.column(x, y).collect();
+    let storeys = column.windows(2).map(|pair| (pair[0], pair[1] - pair[0]));
+    let storeys = storeys.filter(|(_, height)| *height > MIN_STOREY * 2.0 * space.half.z);
+    let places = storeys.flat_map(|(floor, height)| {
+        INDOOR.map(|(part, down)| (DVec3::new(x, y, floor + part * height), down, height))
+    });
+    let clear = places.filter(|(at, _, height)| space.is_clear(*at, (CLEARANCE * height).max(VOXEL)));
+    clear.map(|(at, down, _)| (at, down)).collect()
 }
 
 /// Free places above the ground, with how far cameras look down.

@@ -9,7 +9,7 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use glam::DVec3;
+use glam::{DAffine3, DVec3};
 use rayon::prelude::*;
 use slag_common::Gaussians;
 
@@ -74,31 +74,63 @@ pub fn plan(
         None => up::find(&thin),
     };
     let mut space = Space::new(&thin, grown, up.axis);
-    if up.sign == up::Sign::Unknown && large_from_above(&space, rasterizer)? {
-        space = Space::new(&thin, grown, -up.axis);
+    if matches!(up.sign, up::Sign::Unknown | up::Sign::OfSpread) {
+        let is_upside_down = match looks::kind_of(&space) {
+            SceneKind::Indoor => looks::is_upside_down(&space),
+            _ => large_from_above(&space, rasterizer)?,
+        };
+        if is_upside_down {
+            space = Space::new(&thin, grown, -up.axis);
+        }
     }
     let mut kind = looks::kind_of(&space);
-    let mut looked = look_at_all(&space, rasterizer, kind, cancel)?;
+    let look_at = |space: &Space, kind, cameras| look_at_all(space, rasterizer, kind, cameras, cancel);
+    let mut looked = look_at(&space, kind, looks::of(kind, &space))?;
     // A ball has no floor, and no place within; a room full of floaters has a floor.
     let is_solid = up.sign == up::Sign::Assumed && looked.len() < MIN_GOOD;
     if is_solid || is_object(&looked, &space, kind) {
-        if up.sign != up::Sign::Known {
+        // That a thing is flat does not tell which way is up.
+        if up.sign >= up::Sign::OfSpread {
             space = Space::new(&thin, grown, up::OF_FILES);
         }
+        if up.sign != up::Sign::Known {
+            let DVec3 { x, y, z } = space.up_in_world();
+            tracing::warn!(
+                "the Gaussians do not tell which way is up; taken to be ({x:.2}, {y:.2}, {z:.2}): give --up X,Y,Z if the \
+                 drawings are not upright"
+            );
+        }
         kind = SceneKind::Object;
-        looked = look_at_all(&space, rasterizer, kind, cancel)?;
+        looked = look_at(&space, kind, looks::of(kind, &space))?;
     } else if up.sign == up::Sign::Assumed {
         let advice = "give it with --up X,Y,Z, for example --up 0,0,1 where z points up";
         return Err(refused(format!("the Gaussians do not tell which way is up; {advice}")));
     }
+    let enough = MIN_GOOD.min(settings.n_views);
+    if n_with(&looked, kind, None) < enough {
+        // Floors between storeys; or a thing that cameras among it are too near to.
+        let (other, cameras) = match kind {
+            SceneKind::Indoor => (SceneKind::Indoor, looks::of_storeys(&space)),
+            _ => (SceneKind::Object, looks::of(SceneKind::Object, &space)),
+        };
+        let others = look_at(&space, other, cameras)?;
+        if n_with(&others, other, None) >= enough {
+            (kind, looked) = (other, others);
+        }
+    }
     let n_candidates = looked.len();
     let (good, bad): (Vec<Look>, Vec<Look>) =
         looked.into_iter().partition(|look| look.verdict.fault(kind).is_none());
-    if good.len() < MIN_GOOD.min(settings.n_views) {
-        let (n_good, faults) = (good.len(), faults(&bad, kind));
+    if good.len() < enough {
+        let of = format!("of {n_candidates} planned views of this {kind} scene");
+        let why = match (n_candidates, good.len()) {
+            (0, _) => format!("this {kind} scene has no free place for a camera"),
+            (_, n_good) => format!("only {n_good} {of} can be trusted ({})", faults(&bad, kind)),
+        };
+        let or_up =
+            if settings.up.is_some() { "" } else { ", or state its upward direction with --up X,Y,Z" };
         return Err(refused(format!(
-            "only {n_good} of {n_candidates} planned views of this {kind} scene can be trusted ({faults}); give photos with \
-             --views, remove floaters from the splat, or state its upward direction with --up X,Y,Z"
+            "{why}; give photos with --views, or remove floaters from the splat{or_up}"
         )));
     }
     let (chosen, seen) = greedy(&good, space.scene.len(), settings.n_views);
@@ -120,10 +152,11 @@ fn look_at_all(
     space: &Space,
     rasterizer: &dyn Rasterizer,
     kind: SceneKind,
+    cameras: Vec<DAffine3>,
     cancel: &AtomicBool,
 ) -> Result<Vec<Look>, ViewpointError> {
     let loaded = rasterizer.load(&space.scene)?;
-    let looked = looks::of(kind, space).into_par_iter().map(|camera| {
+    let looked = cameras.into_par_iter().map(|camera| {
         if cancel.load(Ordering::Relaxed) {
             return Err(ViewpointError::Interrupted);
         }

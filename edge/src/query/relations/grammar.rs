@@ -51,6 +51,10 @@ const NEGATIONS: [&str; 4] = ["not", "isn't", "aren't", "never"];
 /// Words that make "within" a distance.
 const UNITS: &str = "m metre metres meter meters cm centimetres centimeters foot feet ft inches yards";
 
+/// Words that name a side or a place only for somebody who stands somewhere.
+const SIDES: [&str; 6] = ["left", "right", "front", "back", "middle", "there"];
+const BEFORE_SIDES: [&str; 6] = ["from", "on", "to", "at", "in", "over"];
+
 /// Parses a text as a phrase; `None` if it names no relation and no pick, or is too long: it is then one thing, for
 /// the text model. [`Phrase::check`] checks the limits.
 ///
@@ -87,6 +91,18 @@ fn refuse(words: &[&str]) -> Result<(), RequestError> {
                 "near in place of a distance, or the distance as radius around a position given as near";
             return refused(words[at..].join(" "), advice.to_owned());
         }
+    }
+    // "Second chair from the left": of nobody knows whom.
+    if let [before @ .., side] = words
+        && SIDES.contains(side)
+        && let before =
+            &before[..before.iter().rposition(|word| !ARTICLES.contains(word)).map_or(0, |at| at + 1)]
+        && before.len() > 1
+        && BEFORE_SIDES.contains(&before[before.len() - 1])
+    {
+        let advice =
+            "what it is left of, near to or counted from, as in \"left of the door\" or \"left of me\"";
+        return refused(words.join(" "), advice.to_owned());
     }
     let is_nth = |word: &str| ["st", "nd", "rd", "th"].iter().any(|end| word.ends_with(end));
     match without_article(words) {
@@ -320,6 +336,11 @@ mod tests {
             ("chair without arms", "\"without\""),
             ("chair within 3 m of the door", "radius"),
             ("twenty-first nearest chair", "100th"),
+            ("the second chair from the left", "left of me"),
+            ("barrel on the right", "left of me"),
+            ("thing on my left", "left of me"),
+            ("barrel in front", "left of me"),
+            ("tent over there", "left of me"),
         ] {
             let error = understand(text).expect_err(text).to_string();
             assert!(error.contains(named), "{error}");
