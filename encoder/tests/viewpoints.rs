@@ -179,16 +179,18 @@ fn a_sky_changes_no_plan() {
     }
 }
 
-/// A room above another: half the height of the house is a floor.
+/// Two rooms above two others: half the height of the house is a floor.
 #[test]
 fn both_storeys_of_a_house_are_seen() {
-    let (low, mut house) = (room(), room());
-    let high = moved(&low, DQuat::IDENTITY, 1.0, DVec3::Z * 2.8);
-    house.means_in_world.extend(high.means_in_world);
-    house.rotations_wxyz.extend(high.rotations_wxyz);
-    house.scales.extend(high.scales);
-    house.opacities.extend(high.opacities);
-    house.sh_dc.extend(high.sh_dc);
+    let mut house = Gaussians::default();
+    for shift in [DVec3::ZERO, DVec3::Y * 4.0].map(|at| [at, at + DVec3::Z * 2.8]).concat() {
+        let room = moved(&room(), DQuat::IDENTITY, 1.0, shift);
+        house.means_in_world.extend(room.means_in_world);
+        house.rotations_wxyz.extend(room.rotations_wxyz);
+        house.scales.extend(room.scales);
+        house.opacities.extend(room.opacities);
+        house.sh_dc.extend(room.sh_dc);
+    }
     let plan = plan_of(&house, None).unwrap();
     assert!(plan.up_in_world.dot(DVec3::Z) > 0.9998, "{:?}", plan.up_in_world);
     let heights: Vec<f64> =
