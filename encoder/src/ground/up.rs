@@ -24,7 +24,7 @@ const MIN_OPACITY: f32 = 0.3;
 /// The median height must lie this far below the middle, relative to the height, to tell up from down.
 const MIN_SKEW: f64 = 0.03;
 /// Distance of a sky's Gaussians from the middle, relative to the median one: a level scene ends at 1.4 times it.
-const FAR: f64 = 6.0;
+const FAR: f64 = 10.0;
 /// Trimmed share at either end of an extent.
 pub(crate) const TRIMMED: f64 = 0.02;
 /// Default without evidence: cameras of photos have y down, and so have most files.
