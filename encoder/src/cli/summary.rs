@@ -90,7 +90,10 @@ fn of_cells(summary: &EncodeSummary) -> Vec<Line> {
         let (n, of_masks) = (found.n_objects, found.n_masks_of_objects);
         let (n_others, n_gaussians, largest_m) =
             (found.n_masks - of_masks, found.n_gaussians, found.largest_m);
-        let objects = format!("{n} of {of_masks} masks, {n_gaussians} Gaussians, up to {largest_m:.1} m");
+        let objects = format!(
+            "{n} of {of_masks} masks, {n_gaussians} Gaussians, up to {largest_m:.1} {}",
+            summary.unit
+        );
         ("objects", format!("{objects}; {n_others} other masks"))
     }));
     lines.extend(summary.occupancy.as_ref().map(|found| {

@@ -89,7 +89,7 @@ impl Inputs {
         if split.n_for_precision > cells::MAX_CELLS_FOR_PRECISION {
             let (n, most) = (split.n_for_precision, cells::MAX_CELLS_FOR_PRECISION);
             let asked = match limits.position_error {
-                PositionError::Within(error) => format!("{error} world units"),
+                PositionError::Within(error) => format!("{error:?} world units"),
                 PositionError::OfSize => "a quarter of the size of small Gaussians".into(),
             };
             let problem = format!(

@@ -155,6 +155,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         n_views: views.used.len(),
         n_views_with_photo: plan.inputs.views.len(),
         n_views_drawn: ingest::n_drawn(views.used.iter().copied()),
+        unit: if manifest.metric { "m" } else { "world units" },
         view_order: plan.settings.run.view_order,
         coverage: views.coverage,
         coverage_secs: plan.coverage_secs,

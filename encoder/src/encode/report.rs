@@ -119,6 +119,8 @@ pub struct EncodeSummary {
     pub n_views_with_photo: usize,
     /// Views whose image is a drawing of the splat, no photo.
     pub n_views_drawn: usize,
+    /// Of lengths: `m` or `world units`.
+    pub unit: &'static str,
     pub view_order: ViewOrder,
     /// What the used views show of what all views show, where the order is by coverage.
     pub coverage: Option<CoverageReport>,

@@ -67,6 +67,6 @@ mod tests {
         };
         assert_eq!((check(1.0), check(0.1)), (Ok(()), Ok(())));
         let error = check(1.0 / 30.0).expect_err("a fifth is cut").to_string();
-        assert!(error.contains("22 %") && error.contains("by 100"), "{error}");
+        assert!(error.contains("22 %") && error.contains("splat 100 times"), "{error}");
     }
 }

@@ -170,20 +170,29 @@ pub(super) fn kind_of(space: &Space) -> SceneKind {
     if is_indoor { SceneKind::Indoor } else { SceneKind::Outdoor }
 }
 
-/// Whether rooms hang from their floors: things stand on floors, so ceilings have the more even heights.
+/// Whether rooms hang from their floors: more things stand on floors than hang from ceilings.
 pub(super) fn is_upside_down(space: &Space) -> bool {
-    let (mut n_low, mut n_high) = (BTreeMap::<i64, f64>::new(), BTreeMap::<i64, f64>::new());
-    for (x, y) in space.lattice(2.0 * VOXEL) {
-        let column: Vec<f64> = space.column(x, y).collect();
-        for pair in column.windows(2).filter(|pair| pair[1] - pair[0] > MIN_STOREY * 2.0 * space.half.z) {
-            let number = |z: f64| (z / VOXEL).round() as i64;
-            *n_low.entry(number(pair[0])).or_default() += 1.0;
-            *n_high.entry(number(pair[1])).or_default() += 1.0;
-        }
-    }
-    // Both have as many ends, so their squares tell which lie at fewer heights.
-    let evenness = |n: &BTreeMap<i64, f64>| n.values().map(|n| n * n).sum::<f64>();
-    evenness(&n_low) > evenness(&n_high)
+    let number = |z: f64| (z / VOXEL).round() as i64;
+    let columns = space.lattice(2.0 * VOXEL).map(|(x, y)| space.column(x, y).map(number).collect());
+    let least = number(MIN_STOREY * 2.0 * space.half.z);
+    let gaps = columns.flat_map(|column: Vec<i64>| {
+        let pairs: Vec<[i64; 2]> = column.windows(2).map(|pair| [pair[0], pair[1]]).collect();
+        pairs.into_iter().filter(|[low, high]| high - low > least)
+    });
+    let gaps: Vec<[i64; 2]> = gaps.collect();
+    let mut heights: Vec<f64> = gaps.iter().map(|[low, high]| (high - low) as f64).collect();
+    let off = (0.1 * slag_math::stats::median(&mut heights).unwrap_or(0.0)) as i64;
+    // Columns that end above the floor below them; for ceilings, with heights negated.
+    let n_off = |ends: Vec<i64>| {
+        let mut n_at = BTreeMap::<i64, usize>::new();
+        ends.iter().for_each(|end| *n_at.entry(*end).or_default() += 1);
+        let most = n_at.values().max().copied().unwrap_or(0);
+        n_at.retain(|_, n| 10 * *n >= 3 * most);
+        let is_off =
+            |end: &&i64| n_at.range(..=**end).next_back().is_some_and(|(floor, _)| **end - floor > off);
+        ends.iter().filter(is_off).count()
+    };
+    n_off(gaps.iter().map(|[low, _]| *low).collect()) < n_off(gaps.iter().map(|[_, high]| -high).collect())
 }
 
 pub(super) fn of(kind: SceneKind, space: &Space) -> Vec<DAffine3> {

@@ -93,13 +93,6 @@ pub fn plan(
         if up.sign >= up::Sign::OfSpread {
             space = Space::new(&thin, grown, up::OF_FILES);
         }
-        if up.sign != up::Sign::Known {
-            let DVec3 { x, y, z } = space.up_in_world();
-            tracing::warn!(
-                "the Gaussians do not tell which way is up; taken to be ({x:.2}, {y:.2}, {z:.2}): give --up X,Y,Z if the \
-                 drawings are not upright"
-            );
-        }
         kind = SceneKind::Object;
         looked = look_at(&space, kind, looks::of(kind, &space))?;
     } else if up.sign == up::Sign::Assumed {
@@ -117,6 +110,13 @@ pub fn plan(
         if n_with(&others, other, None) >= enough {
             (kind, looked) = (other, others);
         }
+    }
+    if kind == SceneKind::Object && settings.up.is_none() {
+        let DVec3 { x, y, z } = space.up_in_world();
+        tracing::warn!(
+            "an object does not tell surely which way is up; taken to be ({x:.2}, {y:.2}, {z:.2}): give --up X,Y,Z if the \
+             drawings are not upright"
+        );
     }
     let n_candidates = looked.len();
     let (good, bad): (Vec<Look>, Vec<Look>) =
