@@ -246,7 +246,7 @@ fn find_views(
 }
 
 /// Version of plan and drawings; a change redraws them.
-const PLAN_VERSION: u32 = 4;
+const PLAN_VERSION: u32 = 5;
 
 /// Draws a splat's planned views beside the poses file, unless they are there.
 pub(super) fn make(
