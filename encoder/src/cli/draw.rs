@@ -17,7 +17,6 @@ use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::raster::{RasterView, Rasterizer, check_near_plane};
-use crate::store::remove_files;
 use crate::viewpoints::{self, DEFAULT_N_VIEWS, DrawnView, ViewpointSettings};
 
 const PLAN_EXAMPLES: &str = "Examples:\n\
@@ -105,8 +104,6 @@ pub(super) fn plan(args: &PlanArgs, progress: &dyn Progress, json: bool) -> Resu
     let plan = viewpoints::plan(&scene, &devices, &settings, default_memory_bytes(), &false.into())?;
     let views = viewpoints::views_of(&plan);
     let about = json!({ "kind": plan.kind, "up": plan.up_in_world });
-    // Drawings of another plan.
-    remove_files(&args.drawing.out.join("images"), |name| name.starts_with("drawn-"))?;
     viewpoints::draw_sharpened(&args.drawing.out, &views, &mut scene, &devices, &name, about, progress)?;
     let poses = args.drawing.out.join(viewpoints::POSES_FILE);
     print(json, &json!({ "plan": plan, "poses": poses }), format!("{plan}\n{}\n", poses.display()))?;

@@ -27,25 +27,30 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
     let here = shell_word(store);
     // The page knows no --activated.
     let shown = if input.activated == Activated::default() { of_input(input) } else { String::new() };
+    let (extent, at) = extent_and_place(&boxes_of(&reader));
     let mut lines = String::from("\nnext\n");
-    writeln!(lines, "  slag-encoder query --store {here} {}", example(&reader))?;
+    writeln!(lines, "  slag-encoder query --store {here} {}", example(&reader, extent))?;
     writeln!(lines, "  slag-encoder view --store {here}{shown}")?;
     writeln!(lines, "  slag-encoder serve --store {here} --listen 0.0.0.0:{PORT}")?;
-    Ok(lines + &of_robot(&reader, &format!("http://0.0.0.0:{PORT}"))?)
+    Ok(lines + &robot_lines(&reader, &format!("http://0.0.0.0:{PORT}"), extent, at)?)
 }
 
 /// Lines for a robot, with the extent it can fetch. `url`: where the store is served.
 pub(super) fn of_robot(reader: &StoreReader, url: &str) -> Result<String> {
+    let (extent, at) = extent_and_place(&boxes_of(reader));
+    robot_lines(reader, url, extent, at)
+}
+
+fn robot_lines(reader: &StoreReader, url: &str, extent: Aabb, at: DVec3) -> Result<String> {
     let manifest = reader.manifest();
     let root = MetadataReader::new(reader.dir()).root_sha256()?;
-    let (extent, at) = extent_and_place(&boxes_of(reader));
     let unit = if manifest.metric { "m" } else { "world units" };
     let size = extent.max - extent.min;
     let base = ["0.0.0.0", "[::]"].iter().fold(url.to_owned(), |url, any| url.replace(any, &host_name()));
     let mut lines = String::from("on the robot\n");
     writeln!(lines, "  slag-edge trust add {base} --sha256 {root}")?;
     writeln!(lines, "  slag-edge fetch --from {base} --at {:.2},{:.2},{:.2} --radius 50", at.x, at.y, at.z)?;
-    writeln!(lines, "  slag-edge query {}", example(reader))?;
+    writeln!(lines, "  slag-edge query {}", example(reader, extent))?;
     writeln!(
         lines,
         "The scene is {:.1} x {:.1} x {:.1} {unit}, from {} to {} without strays.",
@@ -59,8 +64,7 @@ pub(super) fn of_robot(reader: &StoreReader, url: &str) -> Result<String> {
 }
 
 /// A word to ask for: drones survey yards and streets.
-fn example(reader: &StoreReader) -> &'static str {
-    let (extent, _) = extent_and_place(&boxes_of(reader));
+fn example(reader: &StoreReader, extent: Aabb) -> &'static str {
     let width_m = (extent.max - extent.min).truncate().max_element();
     if reader.manifest().geo_reference.is_some() && width_m > HOUSE_M { "car" } else { "chair" }
 }

@@ -21,7 +21,6 @@ use crate::ground::Standing;
 use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{RasterView, check_near_plane};
 use crate::segment::Segmenter;
-use crate::store::remove_files;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
 use crate::{check, ingest};
 
@@ -277,8 +276,6 @@ pub(super) fn make(
         other => other.into(),
     })?;
     tracing::info!("no photos: {plan}");
-    // Drawings of another plan.
-    remove_files(&folder.join("images"), |name| name.starts_with("drawn-"))?;
     let name = inputs.scene.file_name().unwrap_or_default().to_string_lossy();
     let (views, about) = (viewpoints::views_of(&plan), json!({ "plan": id.to_string() }));
     let (rasterizer, progress) = (engines.rasterizer, context.progress);

@@ -161,10 +161,8 @@ fn encoder_before(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<
 /// What a generation has and the next will not, with the flag that keeps it.
 fn lost(reader: &StoreReader, settings: &EncodeSettings, inputs: &Inputs) -> Vec<String> {
     let before = reader.manifest();
-    let has = |section| {
-        let heads = before.cells.iter().filter_map(|cell| reader.shard_head(cell));
-        heads.take(1).any(|head| ShardHeader::has_section(&head, section))
-    };
+    let head = before.cells.iter().find_map(|cell| reader.shard_head(cell)).unwrap_or_default();
+    let has = |section| ShardHeader::has_section(&head, section);
     let is_geographic = inputs.geo_reference.is_some();
     let has_no = |profile: &&Profile| !settings.cells.shards.profiles.contains(profile);
     let profiles: BTreeSet<&Profile> = before.cells.iter().flat_map(|cell| cell.shards.keys()).collect();

@@ -273,7 +273,7 @@ fn steps() -> impl Iterator<Item = u64> {
 
 /// Unit vector. The Gaussians determine the axis, the views its sign: they have up above or the ground before them.
 fn up_by(scene: &Gaussians, views: &[View]) -> DVec3 {
-    let axis = up::find(scene).axis;
+    let axis = up::find(scene, &up::solid(scene)).axis;
     let away = |view: &View| {
         let world_from_camera = view.camera_from_world.inverse().matrix3;
         -(world_from_camera.y_axis + world_from_camera.z_axis).dot(axis)

@@ -36,7 +36,7 @@ pub(crate) enum Sign {
     Known,
     /// Surfaces lie across the axis, which may point down.
     Unknown,
-    /// The scene is flat across the axis, which may point down; of a thing by itself that says nothing.
+    /// The scene is flat across the axis, which may point down. A flat object may stand any way.
     OfSpread,
     Assumed,
 }
@@ -49,9 +49,8 @@ pub(crate) struct Up {
 }
 
 /// Finds the vertical: the direction of most normals; of several, such as walls and floors, the one of least extent.
-/// Without any, the axis of least spread; without that, the files' own.
-pub(crate) fn find(scene: &Gaussians) -> Up {
-    let solid = &solid(scene);
+/// Without any, the axis of least spread; without that, the files' own. `solid`: of [`solid`].
+pub(crate) fn find(scene: &Gaussians, solid: &[u32]) -> Up {
     let normals = normals(scene, solid);
     let total: f64 = normals.iter().map(|(_, weight)| weight).sum();
     let peaks = if total > 0.0 { peaks(&normals, total) } else { Vec::new() };

@@ -17,6 +17,7 @@ use super::plan::{Viewpoint, ViewpointError, ViewpointPlan};
 use crate::ingest;
 use crate::progress::Progress;
 use crate::raster::{Drawing, LoadedScene, RasterView, Rasterizer, check_near_plane};
+use crate::store::remove_files;
 
 pub const POSES_FILE: &str = "transforms.json";
 /// Size of drawings, pixels: that of the photos that the segmenter learnt on, enlarged little.
@@ -117,6 +118,8 @@ pub fn draw_sharpened(
 ) -> Result<(), ViewpointError> {
     check_near_plane(scene, &views.iter().map(|view| view.view).collect::<Vec<_>>())?;
     begin(folder, drawn_from)?;
+    // Drawings of another plan.
+    remove_files(&folder.join("images"), |name| name.starts_with("drawn-"))?;
     let scales = scene.scales.clone();
     scene.scales.iter_mut().flatten().for_each(|scale| *scale *= SQRT_2);
     let blurred = rasterizer.load(scene)?;

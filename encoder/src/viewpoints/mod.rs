@@ -65,22 +65,22 @@ pub fn plan(
     memory.reserve(Phase::Views, "what planned views show", looks::MOST as u64 * looks::LOOK_BYTES);
     memory.rest(0)?;
     let grown = (stride as f32).sqrt();
-    let thin = space::thinned(scene, stride, grown)?;
+    let (thin, solid) = space::thinned(scene, stride, grown)?;
     let up = match settings.up {
         Some(up) => {
             let wrong = || refused(format!("--up {up}: expected three finite numbers, not all 0"));
             up::Up { axis: up.try_normalize().ok_or_else(wrong)?, sign: up::Sign::Known }
         }
-        None => up::find(&thin),
+        None => up::find(&thin, &solid),
     };
-    let mut space = Space::new(&thin, grown, up.axis);
+    let mut space = Space::new(&thin, &solid, grown, up.axis);
     if matches!(up.sign, up::Sign::Unknown | up::Sign::OfSpread) {
         let is_upside_down = match looks::kind_of(&space) {
             SceneKind::Indoor => looks::is_upside_down(&space),
             _ => large_from_above(&space, rasterizer)?,
         };
         if is_upside_down {
-            space = Space::new(&thin, grown, -up.axis);
+            space = Space::new(&thin, &solid, grown, -up.axis);
         }
     }
     let mut kind = looks::kind_of(&space);
@@ -91,7 +91,7 @@ pub fn plan(
     if is_solid || is_object(&looked, &space, kind) {
         // That a thing is flat does not tell which way is up.
         if up.sign >= up::Sign::OfSpread {
-            space = Space::new(&thin, grown, up::OF_FILES);
+            space = Space::new(&thin, &solid, grown, up::OF_FILES);
         }
         kind = SceneKind::Object;
         looked = look_at(&space, kind, looks::of(kind, &space))?;

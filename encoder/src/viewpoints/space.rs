@@ -32,8 +32,12 @@ pub(super) struct Space {
     occupied: Vec<bool>,
 }
 
-/// Every n-th usable Gaussian, without colours, enlarged so that surfaces stay closed.
-pub(super) fn thinned(scene: &Gaussians, stride: usize, grown: f32) -> Result<Gaussians, ViewpointError> {
+/// Every n-th usable Gaussian, without colours, enlarged so that surfaces stay closed; and which of them are solid.
+pub(super) fn thinned(
+    scene: &Gaussians,
+    stride: usize,
+    grown: f32,
+) -> Result<(Gaussians, Vec<u32>), ViewpointError> {
     let mut thin = Gaussians::default();
     for i in (0..scene.len()).filter(|i| scene.is_usable(*i)).step_by(stride) {
         thin.means_in_world.push(scene.means_in_world[i]);
@@ -42,23 +46,23 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize, grown: f32) -> Result<Ga
         thin.opacities.push(scene.opacities[i]);
         thin.sh_dc.push([0.0; 3]);
     }
-    let n_solid = up::solid(&thin).len();
+    let solid = up::solid(&thin);
+    let n_solid = solid.len();
     if n_solid < MIN_GAUSSIANS {
         return Err(ViewpointError::Refused(format!(
             "no views can be planned: {n_solid} Gaussians are opaque and finite, expected at least {MIN_GAUSSIANS}; give photos \
              with --views"
         )));
     }
-    Ok(thin)
+    Ok((thin, solid))
 }
 
 impl Space {
     /// Converts a scene, enlarged by a factor, to the planner's axes, and finds its occupied voxels.
-    pub(super) fn new(world: &Gaussians, grown: f32, up: DVec3) -> Self {
-        let solid = up::solid(world);
-        let x_axis = longest_side(world, &solid, up);
+    pub(super) fn new(world: &Gaussians, solid: &[u32], grown: f32, up: DVec3) -> Self {
+        let x_axis = longest_side(world, solid, up);
         let axes = [x_axis, up.cross(x_axis), up];
-        let ranges = axes.map(|axis| up::extent(world, &solid, axis).unwrap_or_default());
+        let ranges = axes.map(|axis| up::extent(world, solid, axis).unwrap_or_default());
         let size = DVec3::from_array(ranges.map(|(low, high)| high - low));
         let middle = DVec3::from_array(ranges.map(|(low, high)| 0.5 * (low + high)));
         let world_from_plan = DMat3::from_cols(axes[0], axes[1], axes[2]);
@@ -83,7 +87,7 @@ impl Space {
         let occupied = Vec::new();
         let mut space =
             Self { scene, grown, half, plan_from_world, centre_in_world: centre, scale, n, occupied };
-        space.occupied = space.occupied(&solid);
+        space.occupied = space.occupied(solid);
         space
     }
 
