@@ -41,16 +41,16 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     read_short(path, 1 << 32)
 }
 
-/// What a file is instead of what was expected, and what to do then.
+/// What a file holds in place of what was expected, and what to do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{what}; {advice}")]
-pub struct Stranger {
+pub struct WrongContent {
     pub what: &'static str,
     pub advice: &'static str,
 }
 
 /// Returns the text of a file without its byte order mark, which editors and shells of Windows write.
-pub fn text_of(bytes: &[u8]) -> Result<&str, Stranger> {
+pub fn text_of(bytes: &[u8]) -> Result<&str, WrongContent> {
     // Without a mark, every second byte of ASCII text in UTF-16 is 0.
     let is_utf16 = match bytes {
         [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => true,
@@ -59,7 +59,7 @@ pub fn text_of(bytes: &[u8]) -> Result<&str, Stranger> {
     };
     if is_utf16 {
         let advice = "save it as UTF-8, or convert it with iconv -f UTF-16 -t UTF-8";
-        return Err(Stranger { what: "the text is UTF-16, expected UTF-8", advice });
+        return Err(WrongContent { what: "the text is UTF-16, expected UTF-8", advice });
     }
     let packed = match bytes {
         [0x1f, 0x8b, ..] => Some("the file is packed with gzip, expected text"),
@@ -69,12 +69,12 @@ pub fn text_of(bytes: &[u8]) -> Result<&str, Stranger> {
         _ => None,
     };
     if let Some(what) = packed {
-        return Err(Stranger { what, advice: "unpack it, and give what was in it" });
+        return Err(WrongContent { what, advice: "unpack it, and give what was in it" });
     }
-    if let Some(stranger) = stand_in(bytes) {
-        return Err(stranger);
+    if let Some(found) = stand_in(bytes) {
+        return Err(found);
     }
-    let not_utf8 = Stranger { what: "the text is not UTF-8", advice: "save it with that encoding" };
+    let not_utf8 = WrongContent { what: "the text is not UTF-8", advice: "save it with that encoding" };
     let text = std::str::from_utf8(bytes).map_err(|_| not_utf8)?;
     Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
 }
@@ -93,15 +93,15 @@ pub fn check_writable(path: &Path) -> io::Result<()> {
 }
 
 /// Returns what a file is if it is a well-known stand-in, by its first bytes.
-pub fn stand_in(start: &[u8]) -> Option<Stranger> {
+pub fn stand_in(start: &[u8]) -> Option<WrongContent> {
     match start.trim_ascii_start() {
         [b'v', b'e', b'r', b's', b'i', b'o', b'n', b' ', b'h', b't', b't', b'p', ..] => {
             let advice = "bring the file itself with `git lfs pull`";
-            Some(Stranger { what: "this is a pointer of Git LFS", advice })
+            Some(WrongContent { what: "this is a pointer of Git LFS", advice })
         }
         [b'<', b'!' | b'?' | b'h' | b'H', ..] => {
             let advice = "the download was refused or needs a login: download the file itself";
-            Some(Stranger { what: "this is a web page", advice })
+            Some(WrongContent { what: "this is a web page", advice })
         }
         _ => None,
     }
@@ -140,7 +140,7 @@ mod tests {
 
     #[test]
     fn what_stands_in_a_files_place_is_named() {
-        let named = |start: &[u8]| stand_in(start).map(|stranger| stranger.what);
+        let named = |start: &[u8]| stand_in(start).map(|found| found.what);
         assert_eq!(
             named(b"version https://git-lfs.github.com/spec/v1\n"),
             Some("this is a pointer of Git LFS")
@@ -154,7 +154,7 @@ mod tests {
 
     #[test]
     fn texts_of_windows_are_read_and_strangers_are_named() {
-        let of = |bytes: &[u8]| text_of(bytes).map(str::to_owned).map_err(|stranger| stranger.to_string());
+        let of = |bytes: &[u8]| text_of(bytes).map(str::to_owned).map_err(|found| found.to_string());
         assert_eq!(of("\u{feff}[ä]".as_bytes()), Ok("[ä]".into()));
         for text in ["", "{", &"\0".repeat(9)] {
             assert_eq!(of(text.as_bytes()), Ok(text.into()));

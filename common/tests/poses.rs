@@ -206,7 +206,11 @@ fn colmap_errors_have_place_and_fault() {
         let read = read_text(CAMERA, &format!("1 1 0 0 0 0 0 0 1 {name}\n\n"));
         refused(read, &["is not a relative path inside the image folder"]);
     }
-    refused(read_files(&[("cameras.txt", b"")]), &["no poses found"]);
+    refused(read_files(&[("cameras.txt", b"")]), &["no poses found", "give the folder of a COLMAP model"]);
+    refused(
+        read_files(&[("transforms_train.json", b"{}")]),
+        &["no poses found", "give /", "/transforms_train.json"],
+    );
 }
 
 /// Lines of features may be missing, names may have several words; images without a pose are omitted and named.

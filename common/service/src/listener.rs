@@ -140,6 +140,8 @@ async fn converse(
     };
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
+        // A client may say that it has asked all (`nc -N`), and wait for the answer.
+        .half_close(true)
         .auto_date_header(is_of_a_date(SystemTime::now()))
         .keep_alive(!is_reserved)
         .header_read_timeout(at_most(limits.head_timeout))

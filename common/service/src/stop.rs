@@ -2,18 +2,45 @@
 
 use std::io;
 
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// Returns a future that completes at ctrl-c or SIGTERM.
+struct Signals {
+    interrupt: Signal,
+    terminate: Signal,
+    /// `None` under `nohup`, which ignores it: the program outlives its terminal.
+    hangup: Option<Signal>,
+}
+
+impl Signals {
+    /// Installs the handlers.
+    fn new() -> io::Result<Self> {
+        let hangup = (!ignores_hangup()).then(|| signal(SignalKind::hangup())).transpose()?;
+        let [interrupt, terminate] = [SignalKind::interrupt(), SignalKind::terminate()].map(signal);
+        Ok(Self { interrupt: interrupt?, terminate: terminate?, hangup })
+    }
+
+    async fn next(&mut self) {
+        let hung_up = async {
+            match &mut self.hangup {
+                Some(hangup) => hangup.recv().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+            _ = hung_up => {}
+        }
+    }
+}
+
+/// Returns a future that completes at ctrl-c, SIGTERM or SIGHUP.
 ///
 /// The handlers are installed when this returns, so that no signal is lost before the first poll.
 pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let mut signals = Signals::new()?;
     Ok(async move {
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
+        signals.next().await;
         tracing::info!("stopping: requests in progress are finished first");
     })
 }
@@ -22,26 +49,14 @@ pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
 pub fn on_stop(mut stop: impl FnMut() + Send + 'static) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     // The caller may be within another runtime, where none can be driven.
-    let (mut interrupt, mut terminate, mut hangup) = {
+    let mut signals = {
         let _context = runtime.enter();
-        // Under `nohup`, which ignores it, the program outlives its terminal.
-        let hangup = (!ignores_hangup()).then(|| signal(SignalKind::hangup())).transpose()?;
-        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?, hangup)
+        Signals::new()?
     };
     let listening = move || {
         runtime.block_on(async {
             loop {
-                let hung_up = async {
-                    match &mut hangup {
-                        Some(hangup) => hangup.recv().await,
-                        None => std::future::pending().await,
-                    }
-                };
-                tokio::select! {
-                    _ = interrupt.recv() => {}
-                    _ = terminate.recv() => {}
-                    _ = hung_up => {}
-                }
+                signals.next().await;
                 stop();
             }
         });
@@ -60,13 +75,15 @@ fn ignores_hangup() -> bool {
 mod tests {
     use super::*;
 
-    /// Without the handler SIGTERM would end this process.
+    /// Without the handlers each of these would end this process.
     #[tokio::test]
-    async fn sigterm_is_the_signal_to_stop() {
-        let signalled = stop_signal().expect("handlers");
-        let id = std::process::id().to_string();
-        let killed = std::process::Command::new("kill").args(["-TERM", &id]).status();
-        assert!(killed.expect("runs").success());
-        signalled.await;
+    async fn a_terminal_and_a_supervisor_stop_a_service() {
+        for name in ["-TERM", "-HUP", "-INT"] {
+            let signalled = stop_signal().expect("handlers");
+            let id = std::process::id().to_string();
+            let killed = std::process::Command::new("kill").args([name, &id]).status();
+            assert!(killed.expect("runs").success());
+            signalled.await;
+        }
     }
 }

@@ -18,7 +18,7 @@ const HEIF_BRANDS: &str = "heic heix heim heis hevc hevx mif1 msf1 avif";
 #[derive(Debug, thiserror::Error)]
 pub enum PhotoError {
     #[error(transparent)]
-    StandIn(files::Stranger),
+    StandIn(files::WrongContent),
     #[error("a HEIC or AVIF image; convert the photos to JPEG, for example with heif-convert")]
     Heif,
     #[error("the file ends before its image does; copy the photo again")]
@@ -61,8 +61,8 @@ pub fn size_px(path: &Path) -> Option<(u32, u32)> {
 /// Opens a photo as [`head`] does; refuses other files, and damage that decoders would fill with grey or noise.
 pub fn open<'a>(mut input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDecoder + 'a>, PhotoError> {
     let start = input.fill_buf()?;
-    if let Some(stranger) = files::stand_in(start) {
-        return Err(PhotoError::StandIn(stranger));
+    if let Some(found) = files::stand_in(start) {
+        return Err(PhotoError::StandIn(found));
     }
     let brand = start.get(4..12).and_then(|kind| kind.strip_prefix(b"ftyp"));
     if brand.is_some_and(|brand| HEIF_BRANDS.split(' ').any(|known| known.as_bytes() == brand)) {

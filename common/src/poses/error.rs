@@ -4,7 +4,7 @@ use std::fmt::{self, Debug, Display};
 use std::io;
 use std::path::Path;
 
-use crate::files::Stranger;
+use crate::files::WrongContent;
 
 /// Why poses are not read: the file, the place of the fault, what is wrong, and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -80,8 +80,8 @@ impl PoseProblem {
     }
 }
 
-impl From<Stranger> for PoseProblem {
-    fn from(stranger: Stranger) -> Self {
-        Self::new(stranger.what, stranger.advice)
+impl From<WrongContent> for PoseProblem {
+    fn from(found: WrongContent) -> Self {
+        Self::new(found.what, found.advice)
     }
 }

@@ -20,14 +20,13 @@ impl ViewSet {
         let mut kept = HashSet::new();
         // Names of a folder are neighbours: they share everything before the last slash.
         for frames in names.chunk_by(|a, b| folder(a) == folder(b)) {
-            let numbers: Option<BTreeSet<u64>> = frames.iter().map(|name| number(name)).collect();
-            let lowest =
-                numbers.filter(|numbers| numbers.len() == frames.len()).and_then(|n| n.first().copied());
-            let place = |(rank, name): (u64, &&str)| match lowest {
-                Some(lowest) => number(name).unwrap_or(rank) - lowest,
-                None => rank,
-            };
-            let chosen = (0..).zip(frames).filter(|frame| place(*frame).is_multiple_of(n.get().into()));
+            let numbers: Option<Vec<u64>> = frames.iter().map(|name| number(name)).collect();
+            let are_distinct = |all: &Vec<u64>| all.iter().collect::<HashSet<_>>().len() == all.len();
+            let by_name = || (0..frames.len() as u64).collect();
+            let counted: Vec<u64> = numbers.filter(are_distinct).unwrap_or_else(by_name);
+            let lowest = counted.iter().copied().min().unwrap_or_default();
+            let is_chosen = |counted: u64| (counted - lowest).is_multiple_of(n.get().into());
+            let chosen = counted.into_iter().zip(frames).filter(|(counted, _)| is_chosen(*counted));
             kept.extend(chosen.map(|(_, name)| (*name).to_owned()));
         }
         if n.get() > 1 && names.len() > 1 && kept.len() == names.len() {

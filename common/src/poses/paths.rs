@@ -98,7 +98,8 @@ pub(super) struct Stated {
     pub(super) said: String,
 }
 
-/// Restores the stated paths of views that found the same photo as another view; `elsewhere`: one per view. Returns sentences on them, and on the photos `moved`: their number, and the first.
+/// Restores the stated paths of views that found the same photo as another view; `elsewhere`: one per view. Returns
+/// sentences on them, and on the photos `moved`: their number, and the first.
 pub(super) fn settle(
     views: &mut [View],
     elsewhere: Vec<Option<Stated>>,

@@ -9,6 +9,7 @@ mod list;
 mod locate;
 mod place;
 mod stand;
+pub mod stdio;
 mod tools;
 
 use clap::Parser;

@@ -7,19 +7,16 @@ use anyhow::{Context, Result};
 use clap::Parser;
 use rmcp::ServiceExt;
 use rmcp::transport::async_rw::AsyncRwTransport;
+use slag_mcp::stdio::{Ends, MAX_LINE_BYTES, answering};
 use slag_mcp::{Args, Tools, http};
 use slag_service::listen::bind;
 use slag_service::stop::stop_signal;
-use tokio::io::AsyncReadExt;
 use tracing_subscriber::EnvFilter;
 
 /// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
 /// Concurrent questions to the robot.
 const MAX_QUESTIONS: usize = 8;
-/// Longest message on standard input. The library drops longer ones unanswered, so it is far beyond the longest photo,
-/// which its tool refuses by name, however its characters are escaped.
-const MAX_LINE_BYTES: usize = 256 << 20;
 
 fn main() -> ExitCode {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
@@ -60,11 +57,10 @@ fn run(args: Args) -> Result<()> {
 }
 
 async fn speak_on_stdio(tools: Tools) -> Result<()> {
-    let (input, output) = rmcp::transport::stdio();
-    // The library drops a last line without its end, and skips empty ones.
-    let messages = AsyncRwTransport::new_server(input.chain(&b"\n"[..]), output);
-    let messages = messages.with_max_line_length(MAX_LINE_BYTES);
+    let Ends { input, output, written } = answering(tokio::io::stdin(), tokio::io::stdout());
+    let messages = AsyncRwTransport::new_server(input, output).with_max_line_length(MAX_LINE_BYTES);
     let service = tools.serve(messages).await.context("no MCP client on stdin")?;
     service.waiting().await?;
+    written.await??;
     Ok(())
 }

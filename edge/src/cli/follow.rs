@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use crate::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
-use crate::fetch::{FetchRequest, fetch, last_position};
+use crate::fetch::{FetchError, FetchRequest, fetch, last_position, only_follower};
 use crate::http::{App, RESTARTS, keep_following};
 use crate::store::EdgeCache;
 use anyhow::anyhow;
@@ -55,6 +55,7 @@ pub fn watch(
     bar: &Bar,
     json: bool,
 ) -> Result<(), Failure> {
+    let _place = only_follower(cache).map_err(FetchError::from)?;
     let following = Arc::<Following>::default();
     if let Some(at) = request.at {
         following.post(at);
@@ -123,6 +124,7 @@ pub fn follow_in_background(
     following: Arc<Following>,
     app: Arc<App>,
 ) -> Result<Arc<AtomicBool>, Failure> {
+    let place = only_follower(&cache).map_err(FetchError::from)?;
     let cancel = Arc::new(AtomicBool::new(false));
     let stop = Arc::clone(&cancel);
     // The robot is most likely where it was, until a first position is posted.
@@ -150,6 +152,7 @@ pub fn follow_in_background(
         if let Some(Err(error)) = followed {
             tracing::info!("no longer following: {error}");
         }
+        drop(place);
     })?;
     Ok(cancel)
 }

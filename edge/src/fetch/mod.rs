@@ -30,7 +30,7 @@ pub use download::check_address;
 pub use error::FetchError;
 pub use plan::{Held, Plan, Wanted};
 pub use position::{NotAPosition, PlanError, Position, Spoken};
-pub use records::{Accepted, LastFetch, Records, RecordsError, accepted, last_position};
+pub use records::{Accepted, LastFetch, Records, RecordsError, accepted, last_position, only_follower};
 pub use request::{Environment, FetchReport, FetchRequest, Progress, Tally};
 pub use run::fetch;
 pub use slag_models::download::{DownloadFailure, NetworkLimits};

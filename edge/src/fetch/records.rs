@@ -24,6 +24,8 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 pub enum RecordsError {
     #[error("another fetch uses {path}; wait for it or end it", path = path.display())]
     Busy { path: PathBuf },
+    #[error("another `serve --follow` or `fetch --watch` fills {path}; stop it, or give this one another --cache", path = path.display())]
+    Followed { path: PathBuf },
     #[error("{path}: both copies of the record of trust are damaged ({what}): no store is believed, what is on board keeps answering; add the store's newest root with `slag-edge trust add --root FILE`", path = path.display())]
     Damaged { path: PathBuf, what: String },
     #[error(
@@ -77,7 +79,7 @@ impl Records {
     /// Opens the records and repairs a damaged copy; holds the lock until dropped.
     pub fn open(cache: &EdgeCache) -> Result<Self, RecordsError> {
         let busy = || RecordsError::Busy { path: cache.dir().to_owned() };
-        let lock = lock(cache.dir())?.ok_or_else(busy)?;
+        let lock = lock(cache.dir(), "lock")?.ok_or_else(busy)?;
         let copies = copies_of(cache);
         cache.create_dir(&copies.dir)?;
         let (found, damage) = match read(cache, &copies)? {
@@ -177,9 +179,19 @@ fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Result<Option<(Version
     Ok(copies.read(cache.files())?.and_then(|found| found.map(parse).transpose()))
 }
 
-/// Takes the cache's lock, which lasts as long as the file is open; `None`: another fetch has it.
-fn lock(dir: &Path) -> io::Result<Option<File>> {
-    let path = dir.join("lock");
+/// Takes the place of a cache's one follower, which lasts as long as the file is open: two would undo each other's
+/// fetches. `None` where nothing can be written: fetches say so.
+pub fn only_follower(cache: &EdgeCache) -> Result<Option<File>, RecordsError> {
+    match lock(cache.dir(), "follower") {
+        Ok(Some(place)) => Ok(Some(place)),
+        Ok(None) => Err(RecordsError::Followed { path: cache.dir().to_owned() }),
+        Err(_) => Ok(None),
+    }
+}
+
+/// Takes a lock of the cache, which lasts as long as the file is open; `None`: another program has it.
+fn lock(dir: &Path, name: &str) -> io::Result<Option<File>> {
+    let path = dir.join(name);
     fs_err::create_dir_all(dir)?;
     // Also opened to read: opening a pipe only to write would wait for a reader.
     let file = fs_err::OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path)?;
@@ -202,6 +214,17 @@ mod tests {
     use slag_common::tuf::{MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TIMESTAMP_BYTES};
 
     use super::*;
+
+    #[test]
+    fn a_cache_has_one_follower() {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let cache = EdgeCache::open(dir.path());
+        let place = only_follower(&cache).expect("free");
+        let second = only_follower(&cache).expect_err("taken").to_string();
+        assert!(place.is_some() && second.contains("--cache"), "{second}");
+        drop(place);
+        assert!(only_follower(&cache).expect("free again").is_some());
+    }
 
     /// Quotes are the longest: JSON within JSON doubles them.
     #[test]

@@ -36,7 +36,7 @@ pub struct AskParams {
     /// Most answers to a text. Over all texts at most 10,000, or 1,000,000 Gaussians that come at once.
     #[schemars(range(min = 1, max = MAX_GAUSSIANS), extend("default" = DEFAULT_LIMIT), example = 10)]
     limit: Option<usize>,
-    /// Answers to a text before the page.
+    /// Answers to a text before the page; `/query` has one page.
     #[serde(default)]
     #[schemars(example = 0)]
     offset: usize,

@@ -56,6 +56,11 @@ impl Engine {
         budget.check()?;
         let generations = known(self.cache(), manifest);
         let to = generation(self.cache(), snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
+        if let Some(from) = request.from
+            && !generations.contains(&from)
+        {
+            generation(self.cache(), snapshot, from, &generations)?;
+        }
         let from = match request.from {
             _ if generations.iter().all(|of| *of >= to.generation) => None,
             Some(from) if from >= to.generation => {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum OverBudget {
     #[error(
-        "the query needs more than {bytes} bytes of memory, its budget; raise threshold, min_count or voxel, or ask for a smaller radius, box or photo"
+        "the query needs more than {bytes} bytes of memory, its budget; raise threshold, min_count or voxel, lower limit, or ask for a smaller radius, box or photo"
     )]
     Bytes { bytes: u64 },
     #[error(

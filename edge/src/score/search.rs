@@ -1,4 +1,4 @@
-//! Searches: one or several questions over a set of shards, begun by scoring all centroids; and what they find.
+//! Searches of one or several questions over a set of shards, and their results. All centroids are scored first.
 
 use std::sync::Arc;
 

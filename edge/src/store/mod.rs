@@ -12,6 +12,7 @@
 //! | `trust/` | accepted metadata and scene, in two copies | fetch |
 //! | `usage.json` | when each shard was needed last; may be lost | fetch: replaced whole |
 //! | `lock` | locked by the one fetch | |
+//! | `follower` | locked by the one program that follows a robot | |
 //!
 //! Readers need no lock: they read `current` and the files it names, and start over if a fetch replaces it meanwhile.
 

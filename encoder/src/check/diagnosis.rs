@@ -174,7 +174,7 @@ fn mean_psnr_db(
         }
         let view = mistake.map_or(sample.view, |mistake| mistake.corrected(&sample.view));
         let drawing = CheckView { view, ..(*sample).clone() }.draw(scene)?;
-        let psnr_db = sample.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
+        let psnr_db = sample.likeness_db(&drawing);
         is_like |= psnr_db > sample.flat_psnr_db();
         (sum, n, n_pairs) = (sum + psnr_db, n + 1, n_pairs.saturating_add(drawing.counters.pairs));
     }

@@ -27,6 +27,10 @@ pub use view::{CheckError, CheckView, psnr_db};
 /// Width at which an encode compares views.
 const QUICK_WIDTH_PX: u32 = 240;
 
+/// A drawing of another place is 3 dB less like a photo than its mean colour: twice the variance. Half of that allows
+/// for a splat without its ground's texture.
+const UNLIKE_DB: f64 = 1.5;
+
 /// A view is far below others if its squared error is six times theirs.
 const FAR_BELOW_DB: f64 = 8.0;
 
@@ -76,7 +80,7 @@ where
         }
         checks.push(ViewCheck {
             name: view.name.clone(),
-            psnr_db: small.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]),
+            psnr_db: small.likeness_db(&drawing),
             flat_psnr_db: small.flat_psnr_db(),
             covered_share: mean(drawing.coverage.iter().map(|&alpha| f64::from(u8::from(alpha > 0.5)))),
             visible_gaussians: drawing.counters.visible,
@@ -114,8 +118,8 @@ where
     })
 }
 
-/// Whether a drawing looks less like its photo than a plain colour does, where the splat covers it; `None` of a photo
-/// that has one colour there.
+/// Whether a drawing looks clearly less like its photo than a plain colour does, where the splat covers it; `None` of a
+/// photo that has one colour there.
 pub(crate) fn is_unlike(photo: CheckView, scene: &dyn LoadedScene) -> Result<Option<bool>, CheckError> {
     let mut small = at_width(&photo, QUICK_WIDTH_PX)?;
     let drawing = small.draw(scene)?;
@@ -125,7 +129,7 @@ pub(crate) fn is_unlike(photo: CheckView, scene: &dyn LoadedScene) -> Result<Opt
         return Ok(None);
     }
     let psnr_db = small.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
-    Ok(Some(!looks_alike(psnr_db, small.flat_psnr_db())))
+    Ok(Some(!looks_alike(psnr_db + UNLIKE_DB, small.flat_psnr_db())))
 }
 
 fn means_of(checks: &[ViewCheck]) -> Means {

@@ -71,6 +71,19 @@ impl CheckView {
             .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
     }
 
+    /// PSNR of a drawing against the photo, dB. Where the splat is transparent, the photo's mean colour there stands
+    /// behind it: a splat need not show the sky, or the backdrop of a thing.
+    pub(super) fn likeness_db(&self, drawing: &Drawing) -> f64 {
+        let clear = |pixel: usize| f64::from(1.0 - drawing.coverage[pixel].clamp(0.0, 1.0));
+        let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| self.is_valid(*pixel));
+        let n_clear: f64 = pixels().map(|(pixel, _)| clear(pixel)).sum();
+        let behind: [f64; 3] = std::array::from_fn(|c| {
+            let sum: f64 = pixels().map(|(pixel, photo)| clear(pixel) * f64::from(photo[c]) / 255.0).sum();
+            sum / n_clear.max(1e-6)
+        });
+        self.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c] + (clear(pixel) * behind[c]) as f32)
+    }
+
     /// Leaves out the pixels that the drawing does not cover.
     pub(super) fn leave_out(&mut self, drawing: &Drawing) {
         let (width_px, height_px) = self.image.dimensions();
@@ -81,6 +94,10 @@ impl CheckView {
 
     pub(super) fn is_plain(&self) -> bool {
         self.flat_psnr_db() >= PLAIN_DB
+    }
+
+    fn is_valid(&self, pixel: usize) -> bool {
+        self.valid.as_ref().is_none_or(|valid| valid.as_raw()[pixel] > 0)
     }
 
     /// Over the pixels that belong to the photo, dB.
@@ -96,8 +113,7 @@ impl CheckView {
     }
 
     pub(super) fn flat_psnr_db(&self) -> f64 {
-        let is_valid = |pixel: usize| self.valid.as_ref().is_none_or(|valid| valid.as_raw()[pixel] > 0);
-        let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| is_valid(*pixel));
+        let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| self.is_valid(*pixel));
         let colour: [f32; 3] =
             std::array::from_fn(|c| mean(pixels().map(|(_, p)| f64::from(p[c]) / 255.0)) as f32);
         self.psnr_db(|_, c| colour[c])

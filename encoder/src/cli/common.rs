@@ -54,6 +54,9 @@ impl From<Exit> for ExitCode {
     }
 }
 
+/// Most threads for each processor.
+const MOST_THREADS_EACH: usize = 8;
+
 /// Flags that every command has.
 #[derive(Clone, Copy, Debug, Args)]
 pub struct OutputArgs {
@@ -259,8 +262,17 @@ pub fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn
     Ok(models.text_encoder(&session)?)
 }
 
-pub(crate) fn available_threads() -> usize {
-    std::thread::available_parallelism().map_or(1, usize::from)
+/// Threads to work with: as many as processors, or as asked, but so few that they do not hinder each other.
+pub(crate) fn n_threads(asked: Option<u32>) -> usize {
+    let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
+    let most = MOST_THREADS_EACH * n_processors;
+    match asked.map(|n| n as usize) {
+        Some(n) if n > most => {
+            tracing::warn!("--threads {n} is taken as {most}: this machine has {n_processors} processors");
+            most
+        }
+        asked => asked.unwrap_or(n_processors),
+    }
 }
 
 /// Completes on a stop signal from the user or the system.

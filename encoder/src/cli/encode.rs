@@ -15,8 +15,8 @@ use slag_models::gpus::GpuChoice;
 
 use super::choices::ChoiceArgs;
 use super::common::{
-    Exit, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
-    parse_secs, print, profile_parser, warn_of_expiry,
+    Exit, InputArgs, ModelArgs, cancel_flag, lasting_name, n_threads, now_unix_secs, open_models, parse_secs,
+    print, profile_parser, warn_of_expiry,
 };
 use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
@@ -219,7 +219,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     inputs.splat_frame = input.splat_frame.clone();
     inputs.activated = input.activated;
     inputs.geo = geo;
-    run.threads = args.threads.map_or_else(available_threads, |n| n as usize);
+    run.threads = n_threads(args.threads);
     run.memory_bytes = args.memory.unwrap_or_else(default_memory_bytes);
     run.time_budget = args.time_budget;
     run.strict = input.strict;
@@ -456,7 +456,7 @@ impl SamArgs {
             levels: self.sam_levels.unwrap_or(preset.levels),
             ..*preset
         };
-        let n_model_threads = self.sam_threads.map_or_else(available_threads, |n| n as usize);
+        let n_model_threads = n_threads(self.sam_threads);
         Ok(Some(Masks::Sam { dir, settings, n_model_threads }))
     }
 }

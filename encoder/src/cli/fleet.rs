@@ -10,7 +10,7 @@ use clap::Args;
 use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
-use super::common::{Exit, ModelArgs, available_threads, cancel_flag, open_models, print};
+use super::common::{Exit, ModelArgs, cancel_flag, n_threads, open_models, print};
 use super::memory::{default_memory_bytes, parse_memory};
 use crate::blobs::Bucket;
 use crate::encode::{self, EncodeSettings, EncodeSummary, Engines};
@@ -109,7 +109,7 @@ pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
     let resolve = |name: &PathBuf| commands::resolve(name, &|name| std::env::var_os(name));
     let settings = WorkerSettings {
         dispatch,
-        n_threads: args.threads.map_or_else(available_threads, |n| n as usize),
+        n_threads: n_threads(args.threads),
         gpus: args.gpus.numbers(&session),
         memory_bytes: args.memory.unwrap_or_else(default_memory_bytes),
         folder: args.scratch.clone().unwrap_or_else(std::env::temp_dir),

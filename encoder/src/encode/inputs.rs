@@ -206,7 +206,7 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<(), EncodeE
 }
 
 fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError> {
-    for name in names {
+    for name in std::collections::BTreeSet::from_iter(names) {
         let Some(at) = views.iter().position(|view| view.name == *name) else {
             let first = views.first().map_or("", |view| &view.name);
             return Err(EncodeError::Failed(format!(
@@ -224,16 +224,24 @@ fn find_views(
 ) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
     let n_views = views.len();
     let (found, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| v.image_path.is_file());
-    if let (true, Some(first)) = (settings.run.strict, gone.first()) {
-        return Err(EncodeError::Failed(format!(
-            "{} of {n_views} photos are missing, the first is {}; give their folder with --images",
-            gone.len(),
-            first.image_path.display()
-        )));
+    let mut advice = "give the photos' folder with --images".to_owned();
+    if let Some(first) = gone.first() {
+        if let Some(other) = of_the_same_stem(&first.image_path) {
+            advice = format!(
+                "{} is there: the poses must name photos as they are, and JPEG, PNG and WebP are read",
+                other.display()
+            );
+        }
+        if settings.run.strict {
+            return Err(EncodeError::Failed(format!(
+                "{} of {n_views} photos are missing, the first is {}; {advice}",
+                gone.len(),
+                first.image_path.display()
+            )));
+        }
     }
     let skip = |View { name: view, image_path, .. }: View| {
-        let reason =
-            format!("{}: no such photo; give the photos' folder with --images", image_path.display());
+        let reason = format!("{}: no such photo; {advice}", image_path.display());
         SkippedView { view, reason }
     };
     let skipped: Vec<SkippedView> = gone.into_iter().map(skip).collect();
@@ -242,6 +250,12 @@ fn find_views(
         return Err(EncodeError::no_views(n_views, &reason));
     }
     Ok((found, skipped))
+}
+
+/// A file of this name with another ending.
+fn of_the_same_stem(path: &Path) -> Option<std::path::PathBuf> {
+    let files = fs_err::read_dir(path.parent()?).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    files.filter(|other| other.file_stem() == path.file_stem()).min()
 }
 
 /// Version of plan and drawings; a change redraws them.

@@ -237,8 +237,8 @@ fn swaps_sides(orientation: Orientation) -> bool {
     matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// Whether a size is exactly proportional to the camera's, up to [`MAX_UPSCALE`] of it, or that divided by an integer with each side rounded up or
-/// down, as in downscaled copies.
+/// Whether a size is exactly proportional to the camera's, up to [`MAX_UPSCALE`] of it, or that divided by an integer
+/// with each side rounded up or down, as in downscaled copies.
 fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
     let proportional = u64::from(width_px) * u64::from(camera.height_px)
         == u64::from(height_px) * u64::from(camera.width_px);

@@ -183,6 +183,9 @@ impl MetadataReader {
     }
 
     fn no_root(&self) -> StoreError {
+        if self.is_published().unwrap_or(false) {
+            return StoreError::RootLost { path: self.path("1.root.json") };
+        }
         let store = self.store.display();
         StoreError::Failed(format!("{store} has no root yet; run `slag-encoder keys init`, or encode"))
     }

@@ -162,7 +162,7 @@ impl MetadataReader {
     }
 
     /// Whether anything was ever published, which takes a root.
-    fn is_published(&self) -> Result<bool, StoreError> {
+    pub(super) fn is_published(&self) -> Result<bool, StoreError> {
         let is_there = |name: &&str| self.store.join(name).exists();
         Ok([files::MANIFEST, files::MANIFEST_PREVIOUS].iter().any(is_there) || self.is_begun()?)
     }

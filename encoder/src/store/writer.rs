@@ -148,8 +148,8 @@ impl Store {
     /// that this generation needs but robots do not fetch (readers find them in [`Published::extras`]).
     ///
     /// # Errors
-    /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is damaged,
-    /// [`StoreError::Generation`] unless the generation is above the current one.
+    /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is
+    /// damaged, [`StoreError::Generation`] unless the generation is above the current one.
     pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
         for (hash, len_bytes, _) in verify::contents(manifest, extras) {
             self.check_object(hash, len_bytes)?;

@@ -15,6 +15,10 @@ use slag_encoder::raster::{
     CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, pinhole,
 };
 
+use slag_encoder::progress::Silent;
+use slag_lab::generate::Scene;
+use slag_lab::generate::grammar::SceneKind;
+
 use super::fixtures::{needs_shared, photo, read_splat, shared, shrunk};
 
 /// PSNR over all photos, as reported by the trainer (gsplat) at 1000 x 562.
@@ -54,6 +58,22 @@ fn a_scene_that_fits_its_photos_passes() {
     assert!(report.mean_covered_share > 0.9);
     let picture = image::open(pictures_dir.join("0001_DJI_0023.jpg.png")).unwrap();
     assert_eq!((picture.width(), picture.height()), (2000, 562));
+}
+
+/// Trainers mask skies: where the splat shows nothing, nothing is compared with black.
+#[test]
+fn a_splat_without_a_sky_fits_its_photos() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut yard = Scene::new(&[SceneKind::Yard], 111_004, 4);
+    let files = yard.write(folder.path(), &Silent).unwrap();
+    let views = poses::read(&files.views, None).unwrap().views;
+    let mut views: Vec<CheckView> = views.iter().map(|view| shrunk(photo(view), 160)).collect();
+    let report = run(&yard.gaussians, &views, &CheckOptions::default());
+    assert!(report.diagnosis.is_none() && report.mean_covered_share < 0.9, "{}", report.mean_covered_share);
+    for view in &mut views {
+        view.view.camera_from_world *= DAffine3::from_rotation_z(1.0);
+    }
+    assert!(run(&yard.gaussians, &views, &CheckOptions::default()).diagnosis.is_some());
 }
 
 /// Plants each mistake as the inverse of its correction, written independently.

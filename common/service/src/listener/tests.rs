@@ -29,6 +29,10 @@ struct Running {
 async fn start(limits: ConnectionLimits) -> Running {
     let routes = Routes::default()
         .get("/quick", "an answer", async || "done")
+        .get("/slow", "an answer that takes a while", async || {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            "done"
+        })
         .get("/healthz", "whether it lives", async || "alive")
         .post::<u8, _, _>("/things", "takes a thing", 64, async |body: Bytes| As::<&'static str>::new(body));
     let about = About { name: "test", version: "1", license: "MIT", summary: "", errors: &[] };
@@ -86,6 +90,17 @@ async fn half_bodies_leave_room_for_health_and_end() {
     drop(half);
     let again = REQUEST.replace("\r\n\r\n", "\r\nConnection: close\r\n\r\n");
     assert!(ask_once(running.address, &again).await.ends_with("done"));
+}
+
+/// As `nc -N` does: nothing more is asked, and the answer is waited for.
+#[tokio::test]
+async fn a_client_that_has_asked_all_gets_its_answer() {
+    let running = start(ConnectionLimits::default()).await;
+    let mut stream = connect(running.address, &REQUEST.replace("/quick", "/slow")).await;
+    stream.shutdown().await.expect("half closes");
+    let mut received = String::new();
+    stream.read_to_string(&mut received).await.expect("ends");
+    assert!(received.starts_with("HTTP/1.1 200") && received.ends_with("done"), "{received}");
 }
 
 #[tokio::test]

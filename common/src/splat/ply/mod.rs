@@ -1,8 +1,9 @@
 //! PLY files of trained splats, as 3DGS (Kerbl et al. 2023), gsplat, nerfstudio and brush write them, and
 //! compressed PLY files of PlayCanvas. Properties may have any order and type.
 //!
-//! Per vertex: mean `x y z`, rotation `rot_0..3` (wxyz), scale `scale_0..2` (logarithm), `opacity` (logit, or
-//! unsigned integers whose largest is opaque), colour `f_dc_0..2` (or `red green blue`), `f_rest_*` (channel by channel); other properties are ignored.
+//! Per vertex: mean `x y z`, rotation `rot_0..3` (wxyz), scale `scale_0..2` (logarithm), `opacity` (logit; an unsigned
+//! integer is a share of its type's largest value), colour `f_dc_0..2` (or `red green blue`), `f_rest_*` (channel by
+//! channel); other properties are ignored.
 
 mod compressed;
 mod container;

@@ -65,6 +65,7 @@ async fn generations_are_compared_over_http() {
     // The first generation has none before it, not even where one is named.
     let (_, _, first) = service.get("/v1/changes?from=1").await;
     assert_eq!(first["none"]["kind"], "no-earlier-generation", "{first:#}");
+    assert_eq!(service.get("/v1/changes?from=99").await.0, StatusCode::NOT_FOUND);
     // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor. The encoder's
     // clock has gone back: generations are ordered by number.
     let later = shards(&[6, 22, 33]);

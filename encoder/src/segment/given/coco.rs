@@ -156,6 +156,23 @@ pub(super) fn entry<'a>(
         .or_else(|| one(&|entry| entry.rsplit('/').next().is_some_and(|entry| entry.starts_with(&exported))))
 }
 
+/// Tells of masks without a pixel, such as the annotations of data sets that have boxes alone.
+pub(super) fn without_pixels<'a>(
+    path: &Path,
+    rles: impl IntoIterator<Item = &'a (usize, Rle)>,
+) -> Option<String> {
+    let (mut n, mut empty) = (0, Vec::new());
+    for (index, rle) in rles {
+        n += 1;
+        empty.extend(rle.box_px().is_none().then_some(*index));
+    }
+    let (first, n_empty) = (empty.iter().min()?, empty.len());
+    let path = path.display();
+    Some(format!(
+        "{path}: {n_empty} of {n} masks have no pixels, the first is mask {first}: a box alone is no mask"
+    ))
+}
+
 pub(super) fn masks_of_rles(
     path: &Path,
     rles: &[(usize, Rle)],
@@ -296,4 +313,30 @@ pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>
         }
     }
     Ok(ids)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Annotations of boxes alone, and SAM's runs of nothing.
+    #[test]
+    fn masks_without_pixels_are_counted() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let path = dir.path().join("masks.json");
+        let of = |outlines: &str| {
+            let image = r#"{"id": 1, "file_name": "a.png", "width": 8, "height": 8}"#;
+            let annotations: Vec<String> = (outlines.split(';'))
+                .map(|outline| format!(r#"{{"image_id": 1, "segmentation": {outline}}}"#))
+                .collect();
+            let text = format!(r#"{{"images": [{image}], "annotations": [{}]}}"#, annotations.join(","));
+            fs_err::write(&path, text).expect("writes");
+            let masks = read_data_set(&path).expect("masks");
+            without_pixels(&path, masks.values().flatten())
+        };
+        let whole = "[[1,1,5,1,5,5]]";
+        assert_eq!(of(whole), None);
+        let told = of(&format!(r#"{whole};[];{{"size": [8, 8], "counts": [64]}}"#)).expect("told");
+        assert!(told.contains("2 of 3 masks have no pixels, the first is mask 1"), "{told}");
+    }
 }

@@ -4,6 +4,7 @@ mod coco;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use slag_common::{Hash32, View, files};
 
@@ -26,6 +27,8 @@ use coco::too_large;
 pub struct GivenMasks {
     source: Source,
     ignore_ids: Vec<u32>,
+    /// Masks without pixels are told once.
+    told_empty: AtomicBool,
 }
 
 #[derive(Debug)]
@@ -40,9 +43,13 @@ impl GivenMasks {
         let source = if files::metadata(path)?.is_dir() {
             Source::Folder(path.to_owned())
         } else {
-            Source::DataSet { path: path.to_owned(), masks_of_image: coco::read_data_set(path)? }
+            let masks_of_image = coco::read_data_set(path)?;
+            if let Some(told) = coco::without_pixels(path, masks_of_image.values().flatten()) {
+                tracing::warn!("{told}");
+            }
+            Source::DataSet { path: path.to_owned(), masks_of_image }
         };
-        Ok(Self { source, ignore_ids })
+        Ok(Self { source, ignore_ids, told_empty: AtomicBool::new(false) })
     }
 
     /// Whether a view has a file, or an entry in the data set.
@@ -72,7 +79,15 @@ impl GivenMasks {
         }
         match path.extension().is_some_and(|e| e == "png") {
             true => self.masks_of_png(&path, input, false).map(Some),
-            false => coco::masks_of_rles(&path, &coco::read_list(&path)?, input).map(Some),
+            false => {
+                let rles = coco::read_list(&path)?;
+                if let Some(told) = coco::without_pixels(&path, &rles)
+                    && !self.told_empty.swap(true, Ordering::Relaxed)
+                {
+                    tracing::warn!("{told}; files of other photos may have such masks, too");
+                }
+                coco::masks_of_rles(&path, &rles, input).map(Some)
+            }
         }
     }
 
