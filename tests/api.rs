@@ -1,7 +1,6 @@
 //! The APIs as programs use them: the Python client, and both services against their descriptions.
 
-use std::path::Path;
-use std::process::Command;
+use super::*;
 
 use slag_tests::*;
 

@@ -3,14 +3,9 @@
 //! `../shared/cases` makes them by small changes of the labelled house. A row states a command's exit code and
 //! words of its output. The ordinary run does the rows marked `fast`; `.ci/nightly` does all.
 
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use super::*;
 
-use slag_common::container::AlignedBytes;
 use slag_common::manifest::Manifest;
-use slag_common::shard::{Profile, ShardLayout};
-use slag_common::splat::{self, ReadOptions};
-use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
 /// Scripts of `../shared/cases`, in order of dependence.

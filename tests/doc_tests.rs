@@ -1,11 +1,8 @@
 //! The documents are short, and the files, headings, flags and tests that they name exist.
 
-use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use super::*;
 
-use clap::CommandFactory;
-use slag_tests::{files_below, root, sources, words};
-use syn::visit::{self, Visit};
+use slag_tests::{files_below, words};
 
 const MAX_WORDS: usize = 22_000;
 /// Most characters of a line and of a table row, and most columns.

@@ -1,6 +1,6 @@
 //! The doors to other systems before a real robot, each driven by the other project's own software.
 
-use std::process::Command;
+use super::*;
 
 use slag_tests::*;
 

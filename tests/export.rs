@@ -1,6 +1,6 @@
 //! A store as static files behind Python's web server: robots fetch from it as from `serve`.
 
-use std::collections::BTreeSet;
+use super::*;
 
 use slag_tests::*;
 

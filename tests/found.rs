@@ -1,10 +1,9 @@
 //! The Gaussians of an answer are those of the input splat: on the robot, on the encoder, over HTTP, in a picture.
 
-use std::path::Path;
+use super::*;
 
-use glam::DVec3;
 use slag_common::Gaussians;
-use slag_common::splat::{self, ReadOptions, ply};
+use slag_common::splat::ply;
 use slag_tests::*;
 
 /// World units; far below the distance between most neighbours.

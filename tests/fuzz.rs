@@ -1,14 +1,12 @@
 //! Runs every fuzz target on seeds, on the corpus of coverage-guided fuzzing (`fuzz/corpus`), and on thousands of
 //! seeded mutations of both. `SLAG_FUZZ_SECS` sets seconds per target instead of a number of mutations.
 
+use super::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::Path;
-use std::time::{Duration, Instant};
 
 #[path = "../fuzz/src/lib.rs"]
 mod targets;
 
-use slag_math::random::Random;
 use slag_test_support::{memory_of, shared_folder};
 
 /// Memory that a decoder may take in addition to [`MAX_EXPANSION`] times its input: buffers and small images.

@@ -1,13 +1,8 @@
 //! The labelled house: agreement with the field of an independent pipeline.
 
-use std::collections::BTreeMap;
-use std::path::Path;
+use super::*;
 
 use half::f16;
-use serde_json::Value;
-use slag_common::shard::Profile;
-use slag_encoder::lift::field::{read_field, read_regions};
-use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
 fn encode_house(views: &str, store: &Path, flags: &str) -> std::process::Command {

@@ -1,6 +1,6 @@
 //! First trust and a store's metadata, with the real programs.
 
-use std::path::Path;
+use super::*;
 
 use slag_tests::*;
 

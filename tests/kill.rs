@@ -1,11 +1,7 @@
 //! Power cuts: encode and fetch are killed at random moments and restarted.
 
-use std::path::Path;
-use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use super::*;
 
-use serde_json::Value;
-use slag_math::random::Random;
 use slag_tests::*;
 
 /// Runs a command and returns its output, or kills it after a while.

@@ -3,11 +3,8 @@
 //! Every path in the source is resolved through re-exports to the file that defines the item, so a `mod.rs` that only
 //! declares and re-exports its children depends on none. Tests (`#[cfg(test)]`) do not count.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use super::*;
 
-use slag_tests::{root, sources};
-use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
 const CRATES: [(&str, &str); 15] = [

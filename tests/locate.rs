@@ -1,7 +1,7 @@
 //! From a photo to a place to stand: the camera's pose, what the robot finds from there, where it may go.
 
-use glam::{DMat4, DVec3};
-use serde_json::Value;
+use super::*;
+use glam::DMat4;
 use slag_tests::*;
 
 /// Photos without landmarks of their own, with known poses.

@@ -27,5 +27,24 @@ mod tls;
 mod versions;
 mod views;
 
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use clap::CommandFactory;
+use glam::DVec3;
+use serde_json::{Value, json};
+use slag_common::container::AlignedBytes;
+use slag_common::shard::{Profile, ShardLayout};
+use slag_common::splat;
+use slag_common::splat::ReadOptions;
+use slag_encoder::lift::field::{read_field, read_regions};
+use slag_encoder::store::StoreReader;
+use slag_math::random::Random;
+use slag_tests::{root, sources};
+use syn::visit;
+use syn::visit::Visit;
+
 #[global_allocator]
 static ALLOCATOR: slag_test_support::CountingAllocator = slag_test_support::CountingAllocator;

@@ -1,9 +1,7 @@
 //! Manual pages and completions, against the programs' own output and as `man` and bash read them.
 
-use std::path::Path;
-use std::process::Command;
+use super::*;
 
-use clap::CommandFactory;
 use slag_tests::*;
 
 /// The programs, and their least number of pages.

@@ -1,6 +1,6 @@
 //! The data of the page, from both programs, against the scores of the command line.
 
-use serde_json::json;
+use super::*;
 use slag_tests::*;
 
 /// A message of scores: per cell its id and the scores of its Gaussians; `None` for those in no view.

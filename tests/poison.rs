@@ -1,12 +1,7 @@
 //! Every invalid value in every field of a scene: unusable Gaussians are rejected and counted, the store stays finite.
 
-use std::collections::BTreeSet;
-use std::path::Path;
+use super::*;
 
-use slag_common::container::AlignedBytes;
-use slag_common::shard::{Profile, ShardLayout};
-use slag_encoder::lift::field::{read_field, read_regions};
-use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
 /// Converts a PLY of floats into one of doubles.

@@ -1,7 +1,6 @@
 //! Stores and robots against python-tuf, TUF's reference implementation, both ways.
 
-use std::path::Path;
-use std::process::Command;
+use super::*;
 
 use slag_tests::*;
 

@@ -1,7 +1,6 @@
 //! A rotten store: another encode rewrites its files from the kept views, and its catalogue from the files.
 
-use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use super::*;
 
 use slag_tests::*;
 

@@ -1,6 +1,6 @@
 //! The generated room: the demo, reproducible stores, the robot's service.
 
-use serde_json::{Value, json};
+use super::*;
 use slag_tests::*;
 
 #[test]

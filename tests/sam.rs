@@ -1,8 +1,7 @@
 //! Encodes with SAM: a tiny model with random weights, so its masks mean nothing; the code path is the real one.
 
-use std::path::Path;
+use super::*;
 
-use serde_json::Value;
 use slag_common::poses;
 use slag_tests::*;
 

@@ -3,11 +3,9 @@
 //! To record an intended change of `golden/store_bytes.txt`: `SLAG_RECORD=1 cargo test --workspace --test system
 //! store_bytes::`; say why in the commit.
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use super::*;
 
 use slag_common::Hash32;
-use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
 /// Section of a shard that holds its header.

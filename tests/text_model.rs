@@ -1,9 +1,7 @@
 //! A store with the text side of its encoder: robots fetch it with the scene and need no models of their own.
 
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use super::*;
 
-use serde_json::Value;
 use slag_tests::*;
 
 /// The nearest Gaussians whatever their scores, so that equal vectors give equal answers.

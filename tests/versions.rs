@@ -1,9 +1,8 @@
 //! The workspace's version: programs, packages, descriptions and clients state the same.
 
+use super::*;
 use std::io::{BufRead, BufReader, Write};
-use std::process::{Command, Stdio};
 
-use serde_json::{Value, json};
 use slag_tests::*;
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");

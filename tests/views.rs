@@ -1,8 +1,7 @@
 //! Views by coverage: a limit or a time budget stops an encode early; the next one continues.
 
-use std::path::Path;
+use super::*;
 
-use serde_json::Value;
 use slag_tests::*;
 
 const VIEWS: [&str; 4] = ["--n-views", "10", "--seed", "31"];

@@ -1,11 +1,9 @@
 //! Shards with an appearance: round trip, and refusal of columns of another length.
 
-use glam::DVec3;
+use super::*;
 use slag_common::appearance::Appearance;
-use slag_common::container::{self, AlignedBytes, Layout};
-use slag_common::frames::Aabb;
-use slag_common::shard::sample::{self, SampleShard};
-use slag_common::shard::{Additions, MAGIC, ShardHeader, ShardLayout, VERSION, section};
+use slag_common::container::Layout;
+use slag_common::shard::{Additions, MAGIC, VERSION};
 
 fn written(appearance: Option<Appearance<'_>>) -> Vec<u8> {
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::ONE };

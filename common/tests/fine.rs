@@ -1,11 +1,9 @@
 //! Fine residuals of exact shards: round trip, decoding as in docs/formats.md, refusal of invalid ones.
 
-use glam::DVec3;
+use super::*;
 use half::f16;
-use slag_common::container::{AlignedBytes, ContainerError};
-use slag_common::frames::Aabb;
-use slag_common::shard::sample::{self, SampleShard};
-use slag_common::shard::{Basis, ExactColumns, Fine, ScoreErrors, ShardHeader, ShardLayout, ShardView};
+use slag_common::container::ContainerError;
+use slag_common::shard::{Basis, ExactColumns, Fine, ScoreErrors, ShardView};
 
 struct Parts {
     errors: ScoreErrors,

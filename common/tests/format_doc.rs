@@ -1,11 +1,12 @@
 //! The tables of docs/formats.md agree with the constants and layouts of the code.
 
+use super::*;
 use std::mem::offset_of;
 
+use slag_common::manifest;
 use slag_common::objects::{self, ObjectRecord, ObjectsHeader};
 use slag_common::occupancy::{self, OccupancyHeader};
-use slag_common::shard::{self, ShardHeader, section};
-use slag_common::{container, manifest};
+use slag_common::shard;
 
 /// Cells of all table rows of the document.
 fn rows() -> Vec<Vec<String>> {

@@ -8,5 +8,15 @@ mod scannet;
 mod splat;
 mod tuf;
 
+use std::path::Path;
+
+use glam::{DMat3, DVec3};
+use slag_common::container;
+use slag_common::container::AlignedBytes;
+use slag_common::frames::Aabb;
+use slag_common::poses::PoseSource;
+use slag_common::shard::sample::SampleShard;
+use slag_common::shard::{ShardHeader, ShardLayout, sample, section};
+
 #[global_allocator]
 static ALLOCATOR: slag_test_support::CountingAllocator = slag_test_support::CountingAllocator;

@@ -1,10 +1,10 @@
 //! Poses of real scenes, and of small files written for one case each.
 
-use std::path::Path;
+use super::*;
 
-use glam::{DMat3, DVec3};
 use slag_common::camera::{Distortion, View};
-use slag_common::poses::{self, PoseError, PoseSource, ViewSet};
+use slag_common::poses;
+use slag_common::poses::{PoseError, ViewSet};
 use slag_test_support::{needs_shared, shared};
 
 use super::scannet::write;

@@ -1,10 +1,11 @@
 //! Scene folders of ScanNet, made here in the layout of its SensReader, and nerfstudio's frames of splats.
 
+use super::*;
 use std::num::NonZeroU32;
-use std::path::Path;
 
-use glam::{DAffine3, DMat3, DQuat, DVec3};
-use slag_common::poses::{self, Origin, PoseSource, SplatFrame};
+use glam::{DAffine3, DQuat};
+use slag_common::poses;
+use slag_common::poses::{Origin, SplatFrame};
 use slag_common::{Distortion, Similarity};
 
 const INTRINSICS: &str = "1170.187988 0.000000 647.750000 0.000000\n0.000000 1170.187988 483.750000 0.000000\n\

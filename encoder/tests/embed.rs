@@ -1,14 +1,12 @@
 //! Crops against a plain recomputation on a labelled view, and vectors of a whole view.
 
+use super::*;
 use std::{num::NonZeroUsize, time::Instant};
 
-use image::{Rgb, RgbImage};
-use slag_encoder::{
-    embed::{EmbedError, crop, embed_masks},
-    masks::{Bits, BoxPx, Mask, masks_of_labels},
-};
-use slag_models::{Crop, ImageEncoder, InferenceError, ModelDir, SessionOptions};
-use slag_test_support::{memory_of, needs_shared, onnx_runtime, shared, workspace_root};
+use slag_encoder::embed::{EmbedError, crop, embed_masks};
+use slag_encoder::masks::{Bits, masks_of_labels};
+use slag_models::{Crop, ImageEncoder, InferenceError};
+use slag_test_support::{onnx_runtime, workspace_root};
 
 struct Labelled {
     photo: RgbImage,

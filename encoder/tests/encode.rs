@@ -1,14 +1,12 @@
 //! Encodes whose inputs change meanwhile, or whose store cannot be published into.
 
+use super::*;
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-use image::RgbImage;
-use slag_encoder::encode::{self, EncodeSettings, EncodeSummary, Engines, Masks};
-use slag_encoder::progress::{Progress, Silent};
-use slag_encoder::raster::CpuRasterizer;
-use slag_lab::generate::{Scene, grammar};
-use slag_models::{ModelDir, SessionOptions};
+use slag_encoder::encode;
+use slag_encoder::encode::EncodeSummary;
+use slag_encoder::progress::Progress;
 
 /// Acts when a view has its masks, and when a stage begins.
 struct When<F>(F);

@@ -1,18 +1,9 @@
 //! The built-in segmenter on synthetic images with known answers, and on photos with known instances.
 
-use std::path::Path;
+use super::*;
 
-use glam::DAffine3;
-use image::{Rgb, RgbImage};
-use slag_common::{View, poses};
-use slag_encoder::ingest::load_image;
-use slag_encoder::masks::Mask;
-use slag_encoder::raster::pinhole;
-use slag_encoder::segment::{GivenMasks, GraphSegmenter, GraphSettings, SegmentInput, Segmenter};
-use slag_math::random::Random;
-use slag_models::SessionOptions;
+use slag_encoder::segment::{GraphSegmenter, GraphSettings};
 use slag_models::session::find_runtime;
-use slag_test_support::{needs_shared, shared};
 
 fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> Vec<Mask> {
     let (width_px, height_px) = image.dimensions();

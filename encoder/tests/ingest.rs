@@ -1,16 +1,12 @@
 //! Photos: sizes, undistortion, geo-reference.
 
-use std::path::Path;
+use super::*;
 
-use glam::DAffine3;
-use image::{Rgb, RgbImage};
 use slag_common::photo::PhotoError;
-use slag_common::{Distortion, Intrinsics, View, pinhole, poses};
+use slag_common::{Intrinsics, pinhole};
 use slag_encoder::ingest::{
-    GeoError, IngestError, OddPhotos, Oddity, Undistorter, check_memory, drawn_from, load_image,
-    missing_images, read_geo_reference,
+    GeoError, IngestError, OddPhotos, Oddity, check_memory, missing_images, read_geo_reference,
 };
-use slag_test_support::{needs_shared, shared};
 
 fn camera(distortion: Distortion) -> Intrinsics {
     Intrinsics {

@@ -1,17 +1,16 @@
 //! Embeddings at the extremes: rows of the table in docs/numerics.md, against the paper's equation in float64 or a
 //! closed form.
 
-use glam::DVec3;
+use super::*;
 use half::f16;
+use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{Additions, Profile, ShardLayout, ShardView};
-use slag_common::{Gaussians, Hash32};
 use slag_encoder::cells::{self, Cell, CellLimits, PositionError};
 use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable, ViewContributions};
 use slag_encoder::shard::{CellEmbeddings, ShardBuilder, ShardSettings};
 use slag_math::matrix::Rows;
-use slag_math::random::Random;
 
 const DIM: usize = 512;
 

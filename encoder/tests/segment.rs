@@ -1,19 +1,13 @@
 //! Masks: run lengths, users' files, the partition into regions.
 
-use std::path::Path;
+use super::*;
 
-use glam::DAffine3;
-use image::{GrayImage, RgbImage};
+use image::GrayImage;
 use proptest::prelude::*;
-use slag_common::{Distortion, View, poses};
-use slag_encoder::ingest::Undistorter;
 use slag_encoder::masks::regions::{absorb_slivers, partition};
 use slag_encoder::masks::rle::{Rle, RleError};
-use slag_encoder::masks::{BoxPx, Mask, NO_REGION, RegionMap};
-use slag_encoder::raster::pinhole;
-use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput, Segmenter};
-use slag_math::random::Random;
-use slag_test_support::{memory_of, needs_shared, shared};
+use slag_encoder::masks::{NO_REGION, RegionMap};
+use slag_encoder::segment::SegmentError;
 
 /// `None` if no pixel is inside.
 fn mask(width: u32, height: u32, inside: impl Fn(u32, u32) -> bool) -> Option<Mask> {

@@ -1,21 +1,16 @@
 //! Planned views for splats without photos.
 
+use super::*;
 use std::sync::atomic::AtomicBool;
 
-use glam::{DQuat, DVec3};
-use slag_common::Gaussians;
+use glam::DQuat;
 use slag_common::splat::{self, ReadOptions};
-use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
-use slag_encoder::ingest::drawn_from;
-use slag_encoder::progress::Silent;
-use slag_encoder::raster::{CpuRasterizer, Rasterizer};
+use slag_encoder::encode;
+use slag_encoder::raster::Rasterizer;
 use slag_encoder::viewpoints::{
     POSES_FILE, SceneKind, ViewpointError, ViewpointPlan, ViewpointSettings, draw, plan,
 };
-use slag_lab::generate::{Scene, grammar};
-use slag_math::random::Random;
-use slag_models::{ModelDir, SessionOptions};
-use slag_test_support::{needs_shared, nightly, shared};
+use slag_test_support::nightly;
 
 /// Distance between Gaussians of a surface.
 const SPACING: f64 = 0.1;

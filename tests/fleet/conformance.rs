@@ -1,6 +1,6 @@
 //! Behaviour of every fleet, for any bucket and any distribution of work.
 
-use std::process::Command;
+use super::*;
 
 use serde_json::json;
 

@@ -1,14 +1,13 @@
 //! Seeded faults: any part of a fleet is killed, paused, cut off or restarted empty, and the bytes stay the same.
 
+use super::*;
 use std::collections::BTreeMap;
 use std::fmt;
-use std::time::Duration;
 
-use slag_math::random::Random;
 use slag_tests::nightly;
 
 use super::nats::Fleet;
-use super::network::{Network, Weather};
+use super::network::Weather;
 use super::support::*;
 
 /// Number of seeds, unless `SLAG_FAULT_RUNS` is set; `SLAG_FAULT_SEED` is the first.

@@ -1,8 +1,7 @@
 //! Workers with shares, and a folder as bucket.
 
-use std::process::Command;
+use super::*;
 
-use super::conformance::conforms;
 use super::support::*;
 use slag_tests::*;
 

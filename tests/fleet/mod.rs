@@ -9,3 +9,12 @@ mod network;
 mod s3;
 mod secured;
 mod support;
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::Duration;
+
+use slag_math::random::Random;
+
+use conformance::conforms;
+use network::Network;

@@ -1,9 +1,7 @@
 //! Workers fed by a queue: a real nats-server with JetStream.
 
-use std::process::Command;
+use super::*;
 
-use super::conformance::conforms;
-use super::network::Network;
 use super::support::*;
 use slag_tests::*;
 

@@ -1,12 +1,10 @@
 //! The network between a worker and the queue, as a proxy on loopback: delay, loss and partitions. As with TCP, a
 //! lost packet becomes a wait for its retransmission, and a partition silence until it ends.
 
+use super::*;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
-
-use slag_math::random::Random;
 
 /// Least retransmission timeout of TCP (RFC 6298 as in Linux).
 const RETRANSMISSION: Duration = Duration::from_millis(200);

@@ -1,13 +1,12 @@
 //! A fleet over S3: another project's server, with conditional puts.
 
-use std::process::Command;
+use super::*;
 
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use hyper_util::server::conn::auto::Builder;
 use s3s::auth::SimpleAuth;
 use s3s::service::S3ServiceBuilder;
 
-use super::conformance::conforms;
 use super::support::*;
 
 const KEY: &str = "robot";

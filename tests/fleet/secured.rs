@@ -1,7 +1,6 @@
 //! A fleet over the server of `encoder/deploy/nats.conf`: TLS, and a key for each role.
 
-use std::path::PathBuf;
-use std::process::Command;
+use super::*;
 
 use nkeys::KeyPair;
 use slag_tests::*;

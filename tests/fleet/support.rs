@@ -1,9 +1,9 @@
 //! A scene, the store that one process makes of it, and the programs of a fleet.
 
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use super::*;
+use std::path::Path;
+use std::process::{Child, Output, Stdio};
 use std::sync::OnceLock;
-use std::time::Duration;
 
 use serde_json::Value;
 use slag_tests::*;

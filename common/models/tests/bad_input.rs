@@ -1,10 +1,8 @@
 //! Wrong descriptions and files: one clear message each, no panic.
 
-use std::path::Path;
+use super::*;
 
-use crate::common::{link_models, model_dir, needs_shared, options, shared, unhashed};
-use slag_models::{EncoderId, ModelDir, SessionOptions};
-use tempfile::TempDir;
+use slag_models::EncoderId;
 
 /// A copy of the description `name` with replacements, without its files.
 fn changed(name: &str, replacements: &[(&str, &str)]) -> TempDir {

@@ -1,15 +1,8 @@
 //! CLIP's two sides against vectors recorded with transformers, Pillow and openai/CLIP.
 
-use crate::common::{
-    array, assert_recorded, image, link_models, max_difference, model_dir, needs_shared, options, shared,
-    unit,
-};
-use slag_models::{
-    Crop, ModelDir,
-    clean::clean,
-    preprocess::{Filter, Preprocess, Resize, Window, resample},
-    text::Tokens,
-};
+use super::*;
+use slag_models::clean::clean;
+use slag_models::preprocess::{Window, resample};
 
 fn clip_preprocess() -> Preprocess {
     let (mean, std) = ([0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.26130258, 0.27577711]);

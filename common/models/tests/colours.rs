@@ -1,7 +1,7 @@
 //! The stand-in on drawn objects with uneven light and noise.
 
-use image::{Rgb, RgbImage};
-use slag_models::{Crop, ImageEncoder, InferenceError, ModelDir, SessionOptions, TextEncoder};
+use super::*;
+use slag_models::{ImageEncoder, TextEncoder};
 
 fn encoders() -> (Box<dyn ImageEncoder>, Box<dyn TextEncoder>) {
     let (model, options) = (ModelDir::colours(), SessionOptions::new("no-such-library.so".into()));

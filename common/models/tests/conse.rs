@@ -1,12 +1,11 @@
 //! The real small pair: ConSE image vectors and CLIP phrase vectors.
 
+use super::*;
 use std::sync::Arc;
 
-use crate::common::{array, assert_recorded, max_difference, model_dir, needs_shared, options, shared, unit};
 use ::image::{RgbImage, imageops};
 use half::f16;
 use safetensors::SafeTensors;
-use slag_models::{Crop, InferenceError, ModelDir, SessionOptions};
 
 fn golden_images(golden: &std::path::Path) -> Vec<RgbImage> {
     let (shape, levels) = array::<u8>(golden, "images");

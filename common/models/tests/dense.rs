@@ -1,8 +1,8 @@
 //! Vectors of patches against tensors recorded with PyTorch (`tests/models/dense_tiny/export.py`), and texts
 //! without an end token.
 
-use crate::common::{array, assert_recorded, image, made, max_difference, model_dir, options, unit};
-use slag_models::{Crop, ModelDir};
+use super::*;
+use crate::common::made;
 
 #[test]
 fn patches_and_crops_equal_the_recorded_ones() {

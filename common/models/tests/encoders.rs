@@ -1,14 +1,12 @@
 //! Encoders with the variations of CLIP and SigLIP exports: element types, masks, padding, unnamed outputs,
 //! batches. The models are generated here; the expected vectors are computed from their tables in f64.
 
+use super::*;
 use crate::common::made::{
     DESCRIPTION, DIM, SIZE_PX, TextKind, VOCABULARY, WEIGHTS, image_graph, row, text_graph, tokenizer, write,
 };
 use crate::common::onnx::{Element, model, value};
-use crate::common::{max_difference, options, unit};
-use image::{Rgb, RgbImage};
-use slag_models::{Crop, ModelDir, Provider, SessionOptions};
-use tempfile::TempDir;
+use slag_models::Provider;
 
 fn made(description: &str, text: TextKind, image: (Element, i64, bool)) -> TempDir {
     let folder = tempfile::tempdir().expect("a folder");

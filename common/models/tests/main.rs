@@ -11,3 +11,17 @@ mod hub;
 mod sam;
 mod sam2;
 mod siglip2;
+
+use std::path::Path;
+
+use image::{Rgb, RgbImage};
+use slag_models::preprocess::{Filter, Preprocess, Resize};
+use slag_models::sam::{Letterbox, Sam};
+use slag_models::text::Tokens;
+use slag_models::{Crop, InferenceError, ModelDir, SessionOptions};
+use tempfile::TempDir;
+
+use common::{
+    array, assert_recorded, image, link_models, max_difference, model_dir, needs_shared, options, shared,
+    unhashed, unit,
+};

@@ -1,12 +1,9 @@
 //! SAM's two files against tensors recorded with transformers and PyTorch; wrong files, one clear message each.
 
-use std::path::Path;
+use super::*;
 
-use crate::common::{
-    array, image, link_models, max_difference_of_planes as max_difference, model_dir, needs_shared, options,
-    shared, unhashed,
-};
-use slag_models::sam::{Embedding, Letterbox, Sam};
+use crate::common::max_difference_of_planes as max_difference;
+use slag_models::sam::Embedding;
 
 fn open() -> (std::path::PathBuf, Sam) {
     let (golden, options) = (shared("models/sam_tiny/golden.npz"), options());

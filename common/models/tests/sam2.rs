@@ -1,10 +1,10 @@
 //! SAM 2.1's two files, with their weights beside them, against tensors recorded with transformers and PyTorch
 //! (`tests/models/sam2_tiny/export.py`).
 
-use std::path::{Path, PathBuf};
+use super::*;
+use std::path::PathBuf;
 
-use crate::common::{array, image, max_difference_of_planes as max_difference, model_dir, options};
-use slag_models::sam::{Letterbox, Sam};
+use crate::common::max_difference_of_planes as max_difference;
 
 fn golden() -> PathBuf {
     model_dir("sam2_tiny").join("golden.npz")

@@ -1,14 +1,7 @@
 //! SigLIP 2's two sides as `models pull` describes them, against transformers and PyTorch
 //! (`tests/models/siglip2_tiny/export.py`): preprocessing, tokens with their end and padding, vectors.
 
-use std::path::Path;
-
-use crate::common::{array, assert_recorded, image, max_difference, model_dir, options, unit};
-use slag_models::{
-    Crop, ModelDir,
-    preprocess::{Filter, Preprocess, Resize},
-    text::Tokens,
-};
+use super::*;
 
 /// Components of a vector, and pixels of the square; the public models have 768 and 224.
 const DIM: usize = 24;

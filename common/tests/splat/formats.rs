@@ -1,13 +1,10 @@
 //! All formats against `expected.json` (splat-transform 2.7.1, confirmed by a second reader); trained scenes against a
 //! separate parser.
 
+use super::*;
 use std::io::Read;
 
 use serde_json::Value;
-use slag_common::splat::{ReadOptions, read};
-
-use super::generated::gzip;
-use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_well, refused, shared};
 
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().into_iter().flatten().map(|v| v.as_f64().expect("a number")).collect()

@@ -1,15 +1,12 @@
 //! Generated files for cases without a recorded file: SPZ of degree 3 and 4 and its extensions, SOG 1, false counts.
 
-use std::io::Write;
-use std::path::Path;
+use super::*;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use image::codecs::webp::WebPEncoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use slag_test_support::memory_of;
-
-use super::{assert_near, read_all, read_bytes, read_well, refused};
 
 pub fn gzip(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());

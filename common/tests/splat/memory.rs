@@ -1,9 +1,7 @@
 //! Peak memory while ten million Gaussians are read.
 
-use std::io::{BufWriter, Write};
-
-use slag_common::Gaussians;
-use slag_common::splat::{ReadOptions, read};
+use super::*;
+use std::io::BufWriter;
 
 fn peak_rss_bytes() -> usize {
     let status = std::fs::read_to_string("/proc/self/status").expect("Linux");

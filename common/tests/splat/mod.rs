@@ -5,11 +5,14 @@ mod generated;
 mod memory;
 mod ply_variants;
 
+use std::io::Write;
 use std::path::Path;
 
 use slag_common::Gaussians;
 use slag_common::splat::{ReadOptions, SplatError, read};
 use slag_test_support::{needs_shared, shared};
+
+use generated::gzip;
 
 fn read_all(path: &Path) -> Result<Gaussians, SplatError> {
     read(path, &ReadOptions { with_sh_rest: true })

@@ -1,10 +1,7 @@
 //! PLY files in every encoding, type and order of properties, and the writer.
 
-use slag_common::Gaussians;
+use super::*;
 use slag_common::splat::ply;
-
-use super::generated::gzip;
-use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_well, refused, shared};
 
 /// Returns the properties and rows of a plain PLY of floats, read by a separate parser.
 fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {

@@ -1,8 +1,8 @@
 //! Attacks by somebody who holds no key, or the keys of some roles.
 
-use std::collections::BTreeMap;
+use super::*;
 
-use slag_common::tuf::{FileMeta, Kept, Key, MAX_ROOT_BYTES, Snapshot, Targets, TufError, refresh, sign};
+use slag_common::tuf::MAX_ROOT_BYTES;
 
 use super::repo::*;
 

@@ -4,3 +4,7 @@ mod attacks;
 
 mod recovery;
 mod repo;
+
+use std::collections::BTreeMap;
+
+use slag_common::tuf::{FileMeta, Kept, Key, Snapshot, Targets, TufError, refresh, sign};

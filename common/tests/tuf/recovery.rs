@@ -1,6 +1,6 @@
 //! Roots: who may name the next one, and what a new root repairs.
 
-use slag_common::tuf::{FileMeta, Kept, TufError};
+use super::*;
 
 use super::repo::*;
 

@@ -1,12 +1,9 @@
 //! A repository in memory, as written by its owner or by a thief of keys.
 
-use std::collections::BTreeMap;
+use super::*;
 
 use ed25519_dalek::SigningKey;
-use slag_common::tuf::{
-    FileMeta, Kept, Key, RoleKeys, Root, Snapshot, Source, TargetFile, Targets, Timestamp, Trusted, TufError,
-    format_utc, refresh, sign,
-};
+use slag_common::tuf::{RoleKeys, Root, Source, TargetFile, Timestamp, Trusted, format_utc};
 
 /// The clock of the tests, and the default expiry of metadata.
 pub const NOW: u64 = 1_800_000_000;

@@ -7,6 +7,12 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
 use glam::DVec3;
 use serde_json::{Value, json};
+use slag_common::Hash32;
+use slag_common::frames::{GeoReference, Geographic};
+use slag_common::manifest::Manifest;
+use slag_common::occupancy::BuiltOccupancy;
+use slag_common::shard::Additions;
+use slag_common::tuf::{Kept, SignedMetadata, Timestamp, generate_key, one_key_repository, sign};
 use tempfile::TempDir;
 use tower::ServiceExt;
 
@@ -15,10 +21,13 @@ use super::*;
 use crate::fetch::follow::Following;
 use crate::fetch::{Position, Records};
 use crate::query::Engine;
-use crate::store::EdgeCache;
-use crate::testing::{BuiltShard, Gate, Member, TestShard, axes_service, open_gate, write_cache};
-use slag_common::Hash32;
-use slag_common::tuf::{Kept, SignedMetadata, Timestamp, generate_key, one_key_repository, sign};
+use crate::store::{BadCell, CellFault, EdgeCache};
+use crate::testing::{
+    BuiltShard, CALIBRATION, Gate, Member, TestObject, TestShard, axes_service, manifest_of, open_gate,
+    write_cache, write_manifest,
+};
+use openapi::{check, description};
+use v1::room_with;
 
 mod answers;
 mod attacks;

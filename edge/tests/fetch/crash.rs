@@ -1,19 +1,6 @@
 //! Power cuts after every step, and full disks: the old or the new generation remains, whole.
 
-use std::path::Path;
-use std::sync::Arc;
-
-use slag_common::shard::Profile;
-use slag_edge::fetch::{FetchError, FetchReport};
-use slag_edge::store::files::Files;
-use slag_edge::store::{Snapshot, StoreError};
-
-use super::scene::Published;
-use super::server::Server;
-use super::sim::SimFiles;
-use super::{Robot, assert_holds};
-use slag_math::random::Random;
-use slag_test_support::trials;
+use super::*;
 
 /// Damages one copy of the trust records, or neither: the medium rots while the power is off. Only if the power cut
 /// damaged none: together they would be two faults.

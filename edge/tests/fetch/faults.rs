@@ -2,28 +2,14 @@
 //! `SLAG_TRIALS=10000`: more). After each, the old or the new generation answers a real query, whole. Storage
 //! includes the two copies of the trust state, and the usage records.
 
-use std::collections::BTreeSet;
-use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use super::*;
 
-use slag_common::container::AlignedBytes;
-use slag_common::shard::{Profile, ShardLayout};
-use slag_common::tuf::TufError;
-use slag_edge::fetch::FetchError;
-use slag_edge::query::{AnswerKind, Engine, QueryRequest};
-use slag_edge::store::{BadCell, EdgeCache};
+use slag_edge::query::{AnswerKind, QueryRequest};
 use slag_edge::text::{EncoderInfo, TextService};
 use slag_models::{InferenceError, TextEncoder};
 
-use super::Robot;
 use super::crash::rot_one_copy;
-use super::scene::{DIM, ENCODER, FIRST, Published, RootKeys};
-use super::server::{Fault, Seen, Server};
-use super::sim::SimFiles;
-use slag_math::random::Random;
-use slag_test_support::trials;
+use super::scene::DIM;
 
 const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
 const N_THREADS: u64 = 4;

@@ -1,18 +1,11 @@
 //! A moving robot: cells on board around it, and the number of fetches.
 
-use std::sync::atomic::AtomicBool;
-use std::time::Duration;
+use super::*;
 
-use glam::DVec3;
-use slag_common::retry::Backoff;
-use slag_common::shard::Profile;
-use slag_common::tuf::TufError;
-use slag_edge::fetch::follow::{Decision, FollowEnvironment, FollowSettings, Follower, Following, follow};
-use slag_edge::fetch::{FetchError, FetchReport, FetchRequest, FirstRoot, Position, last_position};
+use slag_edge::fetch::follow::{Decision, Follower, follow};
+use slag_edge::fetch::last_position;
 
-use super::scene::{Published, bounds};
-use super::server::Fault;
-use super::{Robot, assert_holds, at, cells};
+use super::scene::bounds;
 
 const N_CELLS: usize = 30;
 

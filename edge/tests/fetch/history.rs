@@ -1,18 +1,13 @@
 //! Changes between a robot's generations, whatever happens in between.
 
-use std::sync::Arc;
+use super::*;
 
 use slag_api::changes::{ChangedThing, ChangesReply};
-use slag_common::Hash32;
-use slag_edge::query::{ChangesRequest, Engine, QueryError};
+use slag_edge::query::{ChangesRequest, QueryError};
 use slag_edge::score::Budget;
 use slag_edge::store::history;
 
-use super::faults::text_service;
-use super::scene::{Published, TestThing};
-use super::server::Server;
-use super::sim::SimFiles;
-use super::{Robot, cells};
+use super::scene::TestThing;
 
 fn thing(id: u64, x: f64, axis: usize) -> TestThing {
     TestThing { cell_id: (x / 10.0) as u32, id, x, axis }

@@ -1,17 +1,10 @@
 //! Attacks and faults of a server that must have no effect.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use super::*;
 
-use slag_common::Hash32;
 use slag_common::manifest::ManifestError;
-use slag_common::shard::Profile;
-use slag_common::tuf::TufError;
-use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, Progress};
-use slag_edge::store::{BadCell, CellFault, Snapshot, StoreError};
 
-use super::scene::{ENCODER, FIRST, Published, ShardSpec, shard};
-use super::server::{Fault, Server};
-use super::{Robot, assert_holds, cells};
+use super::scene::{ShardSpec, shard};
 
 #[derive(Default)]
 struct Count(AtomicU64);

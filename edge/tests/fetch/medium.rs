@@ -1,13 +1,7 @@
 //! A failing medium: an unreadable sector or inode costs its cell only, and ends no program.
 
-use slag_common::shard::Profile;
-use slag_edge::fetch::Records;
-use slag_edge::store::{CellFault, Scrubber};
+use super::*;
 use slag_test_support::{LoopDisk, needs_loop_disk};
-
-use super::scene::Published;
-use super::server::Server;
-use super::{Robot, assert_holds, cells};
 
 /// A shard has more than 12 blocks.
 const N: u32 = 4000;

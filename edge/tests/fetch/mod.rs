@@ -14,22 +14,32 @@ mod sim;
 mod sync;
 mod trust;
 
-use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use glam::DVec3;
-use slag_common::Hash32;
+use slag_common::container::AlignedBytes;
 use slag_common::retry::Backoff;
+use slag_common::shard::{Profile, ShardLayout};
+use slag_common::tuf::{TargetFile, TufError};
+use slag_common::{Hash32, manifest};
+use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following};
 use slag_edge::fetch::{
-    AddedRoot, Environment, FetchError, FetchReport, FetchRequest, FirstRoot, NetworkLimits, Position,
-    Progress, add_root, fetch,
+    AddedRoot, DownloadFailure, Environment, FetchError, FetchReport, FetchRequest, FirstRoot, NetworkLimits,
+    Position, Progress, Records, RecordsError, add_root, fetch,
 };
-use slag_edge::store::{EdgeCache, Snapshot};
+use slag_edge::query::Engine;
+use slag_edge::store::files::Files;
+use slag_edge::store::{BadCell, CellFault, EdgeCache, Scrubber, Snapshot, StoreError};
+use slag_math::random::Random;
+use slag_test_support::trials;
 
-use scene::{NOW, Published};
-use server::Server;
+use faults::text_service;
+use scene::{ENCODER, FIRST, NOW, Published, RootKeys};
+use server::{Fault, Seen, Server};
 use sim::SimFiles;
 
 /// Fetches with short timeouts and few retries.

@@ -1,13 +1,6 @@
 //! A bad or missing cell costs that cell only.
 
-use slag_common::Hash32;
-use slag_common::shard::Profile;
-use slag_edge::fetch::{DownloadFailure, FetchError};
-use slag_edge::store::{BadCell, CellFault, Snapshot};
-
-use super::Robot;
-use super::scene::Published;
-use super::server::{Fault, Seen};
+use super::*;
 
 fn at_cells(
     scene: &Published,

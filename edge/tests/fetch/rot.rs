@@ -1,22 +1,12 @@
 //! A shard that rots on board costs its cell only, is named, and is fetched again.
 
-use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, mpsc};
-use std::time::Duration;
+use super::*;
+use std::sync::mpsc;
 
-use slag_common::shard::Profile;
-use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow};
+use slag_edge::fetch::follow::follow;
 use slag_edge::http::{App, Settings, keep_scrubbing};
-use slag_edge::query::Engine;
-use slag_edge::store::{BadCell, CellFault, Scrubber, Snapshot};
 
-use super::faults::text_service;
 use super::partial::answering;
-use super::scene::Published;
-use super::server::Server;
-use super::sim::SimFiles;
-use super::{Robot, assert_holds, at, cells};
 
 const UNREADABLE: BadCell = BadCell { cell_id: 1, fault: CellFault::Unreadable, old: None };
 

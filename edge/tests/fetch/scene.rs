@@ -1,20 +1,14 @@
 //! Small published scenes: a row of cells, 10 wide, along x.
 
-use std::collections::BTreeMap;
+use super::*;
 
 use ed25519_dalek::SigningKey;
-use glam::DVec3;
 use half::f16;
-use slag_common::Hash32;
-use slag_common::container::AlignedBytes;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
-use slag_common::manifest::{self, Manifest};
+use slag_common::manifest::Manifest;
 use slag_common::shard::sample::{self, SampleObject, SampleObjects, SampleShard};
-use slag_common::shard::{Additions, Profile, ShardHeader, ShardLayout, quantise};
-use slag_common::tuf::{
-    FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, format_utc, sign,
-};
-use slag_math::random::Random;
+use slag_common::shard::{Additions, ShardHeader, quantise};
+use slag_common::tuf::{FileMeta, Key, RoleKeys, Root, Snapshot, Targets, Timestamp, format_utc, sign};
 
 pub const DIM: u32 = 4;
 pub const ENCODER: Hash32 = Hash32([9; 32]);

@@ -1,16 +1,9 @@
 //! A small HTTP/1.1 server that serves a published scene and misbehaves on demand.
 
+use super::*;
 use std::io::{BufRead, BufReader, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::Duration;
-
-use slag_common::tuf::TargetFile;
-use slag_common::{Hash32, manifest};
-
-use super::scene::Published;
 
 #[derive(Clone, Debug, PartialEq)]
 pub enum Fault {

@@ -1,15 +1,10 @@
 //! Storage that can lose power: unsynced data is lost, torn or kept, at random.
 
-use std::collections::{BTreeMap, BTreeSet};
+use super::*;
 use std::io;
-use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 
-use slag_common::container::AlignedBytes;
-use slag_edge::store::files::{Files, Stat};
+use slag_edge::store::files::Stat;
 use slag_edge::store::mmap::FileBytes;
-
-use slag_math::random::Random;
 
 /// Smallest piece of unsynced content lost or kept on its own.
 const SECTOR_BYTES: usize = 128;

@@ -1,16 +1,6 @@
 //! Fetches without faults or with transient ones: downloads, kept and freed shards.
 
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-
-use slag_common::Hash32;
-use slag_common::shard::Profile;
-use slag_edge::fetch::{FetchError, FetchRequest, Progress, Records, RecordsError};
-use slag_edge::store::{EdgeCache, Snapshot, StoreError};
-
-use super::scene::{ENCODER, Published};
-use super::server::Fault;
-use super::{Robot, assert_holds, at};
+use super::*;
 
 #[test]
 fn the_second_fetch_brings_only_the_difference() {

@@ -1,14 +1,9 @@
 //! First trust, and attacks on a robot's records: damaged and lost ones, other roots, other scenes.
 
-use std::path::PathBuf;
+use super::*;
 
-use slag_common::tuf::{TufError, sha256_hex};
-use slag_edge::fetch::{FetchError, FirstRoot, RecordsError, accepted};
-
-use super::scene::{FIRST, Published, RootKeys};
-use super::server::{Fault, Server};
-use super::{Robot, assert_holds};
-use slag_test_support::trials;
+use slag_common::tuf::sha256_hex;
+use slag_edge::fetch::accepted;
 
 const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
 const OTHER: RootKeys = RootKeys { root: 8, online: 9 };

@@ -1,9 +1,9 @@
 //! The rasterisers under test.
 
+use super::*;
 use std::sync::OnceLock;
 
-use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, Precision, adapters};
-use slag_encoder::raster::{CpuRasterizer, Rasterizer};
+use slag_encoder::raster::gpu::Precision;
 
 /// A rasteriser and the tolerances of its arithmetic.
 pub struct Backend {

@@ -1,15 +1,8 @@
 //! Contributions, drawings and their invariants on random scenes, against brute force and each other.
 
-use glam::DVec3;
-use slag_common::{Distortion, Gaussians};
-use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::{Drawing, RasterError, RasterView, ViewWeights};
+use super::*;
 
-use super::backends::{Backend, backends};
-use super::oracle;
-use super::scenes::{random_regions, random_scene, random_view};
-use super::table::{Case, Row};
-use slag_math::random::Random;
+use super::backends::backends;
 
 const SIZES_PX: [(u32, u32); 7] = [(1, 1), (16, 16), (17, 15), (5, 40), (33, 31), (64, 48), (70, 3)];
 

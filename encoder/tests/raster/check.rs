@@ -1,25 +1,15 @@
 //! The scene check on real drone photos: a trained scene, its 18 photos and their COLMAP poses.
 
-use std::path::Path;
+use super::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use glam::{DAffine3, DVec3};
 use slag_common::photo::PhotoError;
-use slag_common::{Gaussians, Intrinsics, View, poses};
-use slag_encoder::check::{
-    CheckError, CheckOptions, CheckReport, CheckView, FrameCause, Mistake, check, suspicions,
-};
+use slag_encoder::check::{CheckError, check, suspicions};
 use slag_encoder::ingest::IngestError;
-use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::{
-    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, pinhole,
-};
-
 use slag_encoder::progress::Silent;
+use slag_encoder::raster::pinhole;
 use slag_lab::generate::Scene;
 use slag_lab::generate::grammar::SceneKind;
-
-use super::fixtures::{needs_shared, photo, read_splat, shared, shrunk};
 
 /// PSNR over all photos, as reported by the trainer (gsplat) at 1000 x 562.
 const TRAINER_PSNR_DB: f64 = 25.02;

@@ -1,16 +1,10 @@
 //! Geometry and opacity at the extremes: rows of the table in docs/numerics.md, against float64.
 
-use glam::{DAffine3, DVec3};
-use slag_common::splat::{self, ReadOptions};
-use slag_common::{Gaussians, pinhole};
-use slag_encoder::masks::RegionMap;
+use super::*;
+use slag_encoder::raster::RegionWeight;
 use slag_encoder::raster::constants::{MAX_IMAGE_PX, MAX_SIDE_PX, SUM_FRACTION_BITS};
-use slag_encoder::raster::{RasterView, RegionWeight};
 
-use super::backends::{Backend, backends};
-use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
-use super::table::{Case, Row};
-use slag_math::random::Random;
+use super::backends::backends;
 use slag_test_support::{is_nightly, trials};
 
 /// Many views of few Gaussians, so that none hides the others. Focal lengths lie within a range.

@@ -1,14 +1,10 @@
 //! Reads the shared test data.
 
-use std::path::{Path, PathBuf};
+use super::*;
+use std::path::PathBuf;
 
-use glam::{DAffine3, DMat3, DVec3};
 use npyz::Deserialize;
-use slag_common::{Distortion, Gaussians, Intrinsics, View, splat};
-use slag_encoder::check::CheckView;
 use slag_encoder::ingest::load_image;
-use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::RasterView;
 use slag_test_support::npz_array;
 pub use slag_test_support::{needs_shared, shared};
 

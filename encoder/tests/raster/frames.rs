@@ -1,16 +1,10 @@
 //! Splats in another frame than their poses: the labelled house, moved.
 
-use glam::{DMat3, DQuat, DVec3};
-use slag_common::{Gaussians, Similarity, View, poses};
-use slag_encoder::check::{
-    CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Mistake, align, check,
-    nerfstudio_defaults,
-};
-use slag_encoder::raster::CpuRasterizer;
+use super::*;
+use slag_common::Similarity;
+use slag_encoder::check::{FrameCandidate, align, check, nerfstudio_defaults};
 
 use slag_test_support::nightly;
-
-use super::fixtures::{needs_shared, photo, read_splat, shared, shrunk};
 
 struct House {
     splat: Gaussians,

@@ -1,13 +1,9 @@
 //! GPU only: chunks and bands, views shared between devices, lost devices.
 
-use slag_encoder::masks::RegionMap;
+use super::*;
 use slag_encoder::raster::devices::{DeviceChoice, DeviceError, Devices};
-use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, adapters};
-use slag_encoder::raster::{CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights};
 
 use super::backends::gpu_is_expected;
-use super::scenes::{random_regions, random_scene, random_view};
-use slag_math::random::Random;
 
 /// Opens the first adapter in its best precision.
 fn open(options: GpuOptions) -> Option<GpuRasterizer> {

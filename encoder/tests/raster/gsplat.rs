@@ -1,8 +1,9 @@
 //! Comparison with recorded weights: a float64 reference, and gsplat 1.5.3.
 
-use super::backends::{Backend, backends};
-use super::fixtures::{Npz, needs_shared, points, view, widened};
+use super::backends::backends;
+use super::fixtures::{Npz, points, view, widened};
 use super::table::{Weights as Sums, by_pair as sums};
+use super::*;
 
 fn recorded(npz: &Npz, k: &str, l: &str, w: &str) -> Sums {
     let (k, l, w) = (npz.array::<u16>(k), npz.array::<u8>(l), npz.array::<f64>(w));

@@ -4,12 +4,9 @@
 //! decides the side of a cut (alpha = 1/255, transmittance = 1e-4), both are right: the truth is an interval, and
 //! no wider.
 
-use std::collections::BTreeMap;
+use super::*;
 
-use glam::{DMat3, DQuat, DVec2, DVec3};
-use slag_common::Gaussians;
-use slag_encoder::masks::{NO_REGION, RegionMap};
-use slag_encoder::raster::RasterView;
+use glam::DVec2;
 
 pub struct Projected {
     pub index: usize,

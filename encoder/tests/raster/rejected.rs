@@ -1,15 +1,9 @@
 //! Gaussians that cannot be drawn are rejected and counted, and do not affect the others.
 
-use glam::DVec3;
-use slag_common::Gaussians;
-use slag_common::splat::{self, ReadOptions};
-use slag_encoder::raster::RasterView;
+use super::*;
 
-use super::backends::{Backend, backends};
+use super::backends::backends;
 use super::extremes::read_ply;
-use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
-use super::table::{Case, Row};
-use slag_math::random::Random;
 
 type Edit = Box<dyn Fn(&mut Gaussians, usize)>;
 

@@ -1,10 +1,6 @@
 //! Generated scenes, views and region maps.
 
-use glam::{DAffine3, DQuat, DVec3};
-use slag_common::{Gaussians, Intrinsics, pinhole};
-use slag_encoder::masks::{NO_REGION, RegionMap};
-use slag_encoder::raster::RasterView;
-use slag_math::random::Random;
+use super::*;
 
 pub trait SceneRandom {
     /// Log-uniform.

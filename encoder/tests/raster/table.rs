@@ -1,13 +1,8 @@
 //! Rows of the table in docs/numerics.md: a range of inputs and its claimed error.
 
-use std::collections::BTreeMap;
+use super::*;
 
-use slag_common::Gaussians;
-use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::{RasterView, ViewWeights};
-
-use super::backends::{Backend, backends};
-use super::oracle;
+use super::backends::backends;
 
 /// Rows with Gaussians at equal depths or on a cut, where the last bit of f32 decides.
 const ROWS_OF_TIES: [&str; 3] = ["pile", "on the cuts", "rotations"];

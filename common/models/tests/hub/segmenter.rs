@@ -1,12 +1,11 @@
 //! Pulling a segmenter, which keeps its weights beside its graphs, and naming one that has no published export.
 
-use std::path::Path;
+use super::*;
 
-use slag_models::hub::{Here, Hub, Side, Source};
 use slag_models::sam::Sam;
 
 use super::server::{Server, hub_of, sha256};
-use crate::common::{model_dir, options};
+use crate::common::model_dir;
 
 const TABLE: &str = r#"
 hub = "http://127.0.0.1:1"

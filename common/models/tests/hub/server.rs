@@ -1,14 +1,14 @@
 //! A hub on this machine that behaves like the real one, or worse, and offers a generated model.
 
+use super::*;
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
-use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use sha2::{Digest, Sha256};
-use slag_models::hub::{Hub, HubOptions, Lock, Table};
+use slag_models::hub::{HubOptions, Lock, Table};
 use tempfile::TempDir;
 
 use crate::common::made::{DESCRIPTION, TextKind, VOCABULARY, image_graph, text_graph, tokenizer};

@@ -4,7 +4,6 @@ use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Float64Type, UInt32Type};
 use arrow_ipc::reader::StreamReader;
 use futures_util::TryStreamExt;
-use serde_json::json;
 
 use super::*;
 

@@ -1,13 +1,8 @@
 //! Changes between generations: `GET /v1/changes`.
 
-use slag_common::frames::{GeoReference, Geographic};
-use slag_common::manifest::Manifest;
-
-use super::openapi::{check, description};
 use super::*;
 use crate::query::MAX_TEXTS;
-use crate::store::{BadCell, CellFault, OldShard, Snapshot, history};
-use crate::testing::{CALIBRATION, TestObject, manifest_of, write_manifest};
+use crate::store::{OldShard, Snapshot, history};
 
 /// 20 Gaussians at x = 3, and objects at x = their ids, each along the axis of its id modulo 3. Different objects
 /// come from different splats.

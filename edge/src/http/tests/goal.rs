@@ -1,11 +1,9 @@
 //! Places to stand: `GET /v1/goal` and `GET /v1/floor`.
 
-use slag_common::occupancy::{Block, BuiltOccupancy};
+use slag_common::occupancy::Block;
 
-use super::openapi::{check, description};
-use super::v1::{room_of, room_with};
+use super::v1::room_of;
 use super::*;
-use crate::store::{BadCell, CellFault};
 
 /// Occupancy of the room: a floor from -1 to 5 m along x and to 4 m along y, and the boxes of two mugs and a table.
 pub(super) fn places() -> BuiltOccupancy {

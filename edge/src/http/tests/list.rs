@@ -1,14 +1,11 @@
 //! The objects on board: names, order, positions, tables and maps.
 
 use slag_common::container::AlignedBytes;
-use slag_common::frames::{Aabb, GeoReference, Geographic};
-use slag_common::manifest::Manifest;
+use slag_common::frames::Aabb;
+use slag_common::shard::ShardLayout;
 use slag_common::shard::sample::{SampleObject, SampleObjects};
-use slag_common::shard::{Additions, ShardLayout};
 
-use super::v1::room_with;
 use super::*;
-use crate::testing::{manifest_of, write_manifest};
 
 const FIRST: &str = "o0000000000000001";
 const SECOND: &str = "o0000000000000002";

@@ -1,6 +1,5 @@
 //! `POST /v1/locate`.
 
-use super::openapi::{check, description};
 use super::*;
 
 async fn post(service: &Service, query: &str, kind: &str, photo: Vec<u8>) -> (StatusCode, Value) {

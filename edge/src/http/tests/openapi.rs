@@ -8,7 +8,6 @@ use slag_service::routes::Route;
 use super::problem::Members;
 use super::router::{ABOUT, described};
 use super::*;
-use crate::testing::{CALIBRATION, TestObject};
 
 pub(super) fn description() -> Value {
     let (_, table) = described();

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 
 use super::*;
-use crate::testing::{CALIBRATION, TestObject};
 
 /// Two things, 20 m apart, each in two cells: in one every Gaussian matches, in the other every second.
 fn two_things(has_packed_indices: bool) -> [BuiltShard; 2] {

@@ -1,11 +1,9 @@
 //! Version 1 of the API: reply type, areas, pages, relations, objects on board, events.
 
 use futures_util::StreamExt;
-use slag_common::occupancy::BuiltOccupancy;
 
 use super::*;
 use crate::query::map_status;
-use crate::testing::{CALIBRATION, TestObject};
 
 /// Gaussians on a lattice between two corners, in steps of 0.01.
 fn lattice(from: [u16; 3], to: [u16; 3], n: [u16; 3], axis: usize) -> Vec<Member> {

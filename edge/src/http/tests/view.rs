@@ -6,7 +6,6 @@ use glam::DAffine3;
 use half::f16;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::photo_poses::BuiltPhotoPoses;
-use slag_common::shard::Additions;
 use slag_common::{Gaussians, View, pinhole};
 
 use super::*;

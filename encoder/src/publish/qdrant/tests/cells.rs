@@ -1,6 +1,6 @@
 //! One collection a cell, and snapshots.
 
-use super::server::{Held, Server, Stored};
+use super::server::Stored;
 use super::*;
 
 const NAMES: [&str; 3] = ["yard-cell-0", "yard-cell-1", "yard-cell-2"];

@@ -1,11 +1,11 @@
 //! The collections and snapshots of the small Qdrant.
 
+use super::*;
 use ::qdrant_client::qdrant::collections_server::Collections;
 use ::qdrant_client::qdrant::snapshots_server::Snapshots;
 use ::qdrant_client::qdrant::*;
-use tonic::{Request, Response, Status};
 
-use super::server::{Held, Server, service};
+use super::server::service;
 
 fn done() -> Response<CollectionOperationResponse> {
     Response::new(CollectionOperationResponse { result: true, ..Default::default() })

@@ -1,15 +1,15 @@
 //! Index settings: what is sent at creation, and to collections that exist.
 #![expect(deprecated, reason = "older servers know no other field than the deprecated ones")]
 
+use qdrant_client::qdrant::quantization_config::Quantization as Stored;
+use qdrant_client::qdrant::quantization_config_diff::Quantization as Diff;
 use qdrant_client::qdrant::{
     BinaryQuantization, CollectionParamsDiff, CompressionRatio, CreateCollection, CreateCollectionBuilder,
-    Disabled, Distance, HnswConfigDiff, ProductQuantization, QuantizationConfig, QuantizationConfigDiff,
-    QuantizationType, ScalarQuantization, UpdateCollection, VectorParamsBuilder, VectorParamsDiff,
-    VectorsConfigDiff, quantization_config::Quantization as Stored,
-    quantization_config_diff::Quantization as Diff, vectors_config_diff,
+    Disabled, HnswConfigDiff, ProductQuantization, QuantizationConfig, QuantizationConfigDiff,
+    QuantizationType, ScalarQuantization, UpdateCollection, VectorParamsDiff, VectorsConfigDiff,
+    vectors_config_diff,
 };
 
-use super::server::Server;
 use super::*;
 use crate::publish::qdrant::settings::Quantisation;
 

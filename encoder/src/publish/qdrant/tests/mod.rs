@@ -15,13 +15,13 @@ use qdrant_client::qdrant::{Distance, VectorParamsBuilder, value::Kind};
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::ShardRecord;
 use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
-
 use slag_math::random::Random;
+use tonic::{Request, Response, Status};
 
 use super::*;
 use crate::store::tests::{manifest_of_boxes, new_store};
 use crate::store::{Extras, Store};
-use server::Server;
+use server::{Held, Server};
 
 const DIM: usize = 16;
 /// Gaussians of the cells, and those of them with an embedding.

@@ -1,7 +1,8 @@
 //! A small Qdrant: the generated gRPC services over points in memory.
 
-use std::collections::{BTreeMap, HashMap};
-use std::sync::{Arc, Mutex};
+use super::*;
+use std::collections::HashMap;
+use std::sync::Mutex;
 
 use ::qdrant_client::qdrant::collections_server::CollectionsServer;
 use ::qdrant_client::qdrant::points_server::{Points, PointsServer};
@@ -12,7 +13,6 @@ use ::qdrant_client::qdrant::{
     condition::ConditionOneOf, r#match::MatchValue, point_id::PointIdOptions, value,
 };
 use ::qdrant_client::qdrant::{points_selector::PointsSelectorOneOf, vectors::VectorsOptions};
-use tonic::{Request, Response, Status};
 
 #[derive(Clone, Debug)]
 pub(super) struct Stored {

@@ -3,12 +3,12 @@
 //! `langsplat_mask_nms.json` has 24 sets of rectangles and ellipses with scores, and what LangSplat's
 //! `masks_update` kept of each with the thresholds of its `sam_encoder`. None of its code is here.
 
+use super::*;
 use serde::Deserialize;
 
-use crate::masks::BoxPx;
+use crate::segment::sam::ScoreFilter;
 use crate::segment::sam::filter::{Candidate, keep_by_score};
 use crate::segment::sam::runs::{Run, RunMask};
-use crate::segment::sam::ScoreFilter;
 
 #[derive(Deserialize)]
 struct Recorded {

@@ -1,9 +1,8 @@
 //! Automatic masks of Segment Anything 2: photos are stretched, prompts without an object give no mask.
 
-use slag_common::{View, pinhole};
+use slag_common::pinhole;
 
 use super::*;
-use crate::segment::SegmentInput;
 
 fn open(settings: SamSettings) -> SamSegmenter {
     let session = SessionOptions::new(onnx_runtime());
