@@ -243,27 +243,23 @@ fn strays_cost_no_precision(files: &[&str]) {
 }
 
 #[needs_shared]
-#[test]
 fn the_fast_cases_end_as_expected() {
     run_cases(|is_fast| is_fast);
 }
 
 #[needs_shared]
 #[nightly("all inputs, several minutes")]
-#[test]
 fn all_cases_end_as_expected() {
     run_cases(|_| true);
 }
 
 #[needs_shared]
-#[test]
 fn a_stray_costs_no_precision() {
     strays_cost_no_precision(&["f_1_100000.ply"]);
 }
 
 #[needs_shared]
 #[nightly("fifteen encodes")]
-#[test]
 fn strays_at_any_distance_cost_no_precision() {
     strays_cost_no_precision(&[
         "p18_far_floaters.ply",

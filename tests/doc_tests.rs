@@ -134,8 +134,7 @@ fn commands(text: &str) -> Vec<Vec<String>> {
         is_fenced ^= line.trim_start().starts_with("```");
         if is_fenced || line.starts_with("    ") {
             let line = line.split(" #").next().unwrap_or_default().trim();
-            let last = lines.last_mut().expect("never empty");
-            *last += line.strip_suffix('\\').unwrap_or(line);
+            *lines.last_mut().expect("never empty") += line.strip_suffix('\\').unwrap_or(line);
             if !line.ends_with('\\') {
                 lines.push(String::new());
             }

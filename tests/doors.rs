@@ -68,7 +68,6 @@ fn cyclone_dds_asks_a_robot() {
 
 /// Odometry turned and moved against the scene; six photos without landmarks of their own determine the transform.
 #[nightly("encodes a room with landmarks")]
-#[test]
 fn cyclone_dds_tells_a_robot_where_it_is() {
     let python = python_with("doors/ros/tests");
     let room = ["--n-views", "24", "--seed", "7"];

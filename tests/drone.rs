@@ -4,7 +4,6 @@ use slag_tests::*;
 
 /// The splat fits the photos as well as the scene's notes state (25.02 dB at 1000 px).
 #[needs_shared]
-#[test]
 fn check_confirms_the_poses() {
     let scene = shared("scenes/brighton");
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -20,7 +19,6 @@ fn check_confirms_the_poses() {
 
 /// Encodes photos with automatic masks and fetches the shards around a place in metres and in degrees.
 #[needs_shared]
-#[test]
 fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let (scene, _) = (shared("scenes/brighton"), shared("models/image_encoder"));
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -52,8 +50,7 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
         shards
     };
     let by_metres = fetch(["--at", "0,0,2"], "metres");
-    let by_degrees = fetch(["--at-geo", "46.842657,-91.994008,160.509"], "degrees");
-    assert_eq!(by_metres, by_degrees);
+    assert_eq!(by_metres, fetch(["--at-geo", "46.842657,-91.994008,160.509"], "degrees"));
     assert_eq!(by_metres.len() as u64, nearby);
 
     let cache = dir.path().join("metres");

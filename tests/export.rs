@@ -18,8 +18,7 @@ fn robots_fetch_from_static_files() {
     let n_shards = content(&store).into_iter().map(|(_, hash)| hash).collect::<BTreeSet<_>>().len();
     assert_eq!(export()["n_files"], n_shards);
     assert_eq!(export()["n_files"], 0, "a second export has nothing to write");
-    let object =
-        std::fs::read_dir(site.join("v1/objects")).expect("listed").next().expect("one").expect("read");
+    let object = std::fs::read_dir(site.join("v1/objects")).unwrap().next().unwrap().unwrap();
     let mut bytes = std::fs::read(object.path()).expect("read");
     bytes[7] ^= 1;
     std::fs::write(object.path(), bytes).expect("written");

@@ -270,8 +270,7 @@ impl<'ast> Visit<'ast> for Module {
 /// The layers in ARCHITECTURE.md: modules of each crate, from the bottom up.
 fn stated_layers() -> BTreeMap<String, Vec<Vec<String>>> {
     let text = fs_err::read_to_string(root().join("ARCHITECTURE.md")).expect("ARCHITECTURE.md");
-    let block =
-        text.split("```layers\n").nth(1).expect("a block ```layers").split("```").next().expect("its end");
+    let block = text.split("```layers\n").nth(1).unwrap().split("```").next().unwrap();
     let mut layers: BTreeMap<String, Vec<Vec<String>>> = BTreeMap::new();
     for line in block.lines().filter(|line| !line.trim().is_empty()) {
         let (name, rest) = line.split_once(':').unwrap_or_else(|| panic!("{line:?}: NAME: layer < layer"));

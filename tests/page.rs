@@ -103,8 +103,7 @@ fn things_carry_pictures_of_themselves() {
         };
         let picture = picture_of(&robot);
         assert_eq!(picture, picture_of(&site.store));
-        let picture =
-            image::load_from_memory_with_format(&picture, image::ImageFormat::Jpeg).expect("a JPEG");
+        let picture = image::load_from_memory_with_format(&picture, image::ImageFormat::Jpeg).unwrap();
         let photo = photos.join("images").join(object["evidence"]["photo"].as_str().expect("a name"));
         let photo = image::open(photo).expect("a photo").to_rgb8();
         let edges: Vec<u32> =
@@ -118,8 +117,7 @@ fn things_carry_pictures_of_themselves() {
         }
     }
     let on_compact = site.robot(&[]);
-    let listed = on_compact.get("/v1/objects");
-    assert_eq!(listed["objects"][0]["evidence"]["has_thumbnail"], false);
+    assert_eq!(on_compact.get("/v1/objects")["objects"][0]["evidence"]["has_thumbnail"], false);
 }
 
 fn mean_colour(picture: &image::RgbImage) -> [f64; 3] {

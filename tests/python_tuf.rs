@@ -5,7 +5,6 @@ use super::*;
 use slag_tests::*;
 
 #[nightly("installs python-tuf and runs it 40 times")]
-#[test]
 fn python_tuf_verifies_stores_and_robots_follow_python_tuf() {
     let python = python_with("tests/python_tuf");
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -108,8 +108,7 @@ fn an_encode_heals_a_store_from_kept_views() {
 fn a_field(store: &Path) -> String {
     let mut entries = fs_err::read_dir(store.join("extras")).expect("there");
     let extras = entries.next().expect("one").expect("readable").path();
-    let extras: serde_json::Value =
-        serde_json::from_slice(&fs_err::read(extras).expect("there")).expect("JSON");
+    let extras: serde_json::Value = serde_json::from_slice(&fs_err::read(extras).unwrap()).unwrap();
     let hash = extras.as_object().expect("a map").values().next().and_then(|hash| hash.as_str());
     hash.expect("a hash").to_owned()
 }

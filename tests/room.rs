@@ -15,7 +15,6 @@ fn the_demo_answers_rightly() {
 
 /// Evaluates the embedded encoders on unseen shapes and pairs of noun and colour, for the figures of their card.
 #[nightly("evaluates 30 scenes")]
-#[test]
 fn the_embedded_encoders_tell_things() {
     let report = run_json(&mut lab(&["eval", "encoder", "--n-scenes", "30"]));
     println!("{}", report["tallies"]);

@@ -8,7 +8,6 @@ use slag_tests::*;
 /// Damaged photos are omitted and named; the store does not depend on threads; a model directory of another kind is
 /// refused in one message.
 #[needs_shared]
-#[test]
 fn sam_finds_masks_the_same_for_any_number_of_threads() {
     let (house, _) = (shared("scenes/house_a"), shared("models/sam_tiny"));
     let dir = tempfile::tempdir().expect("a temporary folder");

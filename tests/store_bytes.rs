@@ -29,7 +29,6 @@ fn generated_scenes_have_the_recorded_bytes() {
 
 /// Given masks, half-labelled photos, Gaussians of a trainer.
 #[needs_shared]
-#[test]
 fn the_house_has_the_recorded_bytes() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let house = shared("scenes/house_a");

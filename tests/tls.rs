@@ -51,8 +51,7 @@ fn robots_and_stores_speak_tls() {
     run(&mut fetch(&ca(&other)));
 
     // A certificate that only an authority may have, and an address with http.
-    let authoritys = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
-    other.issue_as(authoritys, &cert, &key);
+    other.issue_as(rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained), &cert, &key);
     refused(&mut fetch(&ca(&other)), "basicConstraints=critical,CA:FALSE");
     let plain = service.url.replace("https://", "http://");
     refused(

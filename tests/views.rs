@@ -40,12 +40,10 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert!(coverage(&six) > coverage(&three) && coverage(&three) > 0.3, "{three} {six}");
     assert_ne!(content(&store), of_three);
     // A lower limit: the same three, from kept contributions.
-    let three = encode(&["--views-limit", "3"]);
-    assert_eq!(counts(&three), [3, 3]);
+    assert_eq!(counts(&encode(&["--views-limit", "3"])), [3, 3]);
     assert_eq!(content(&store), of_three, "the views that are left over do not show");
     // A budget of no time: the kept views only.
-    let stopped = encode(&["--time-budget", "0.000001"]);
-    assert_eq!(counts(&stopped), [6, 6]);
+    assert_eq!(counts(&encode(&["--time-budget", "0.000001"])), [6, 6]);
     // All views: the bytes of an encode without an order.
     let all = encode(&["--view-order", "coverage"]);
     assert_eq!((counts(&all), coverage(&all)), ([10, 6], 1.0));
@@ -56,8 +54,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert_eq!(counts(&encode(&["--views-limit", "2", "--min-mask-px", "300"])), [2, 0]);
 
     // An empty store and no time: a generation of one view.
-    let one = encode_into("one", &["--time-budget", "0.000001", "--threads", "1"]);
-    assert_eq!(counts(&one), [1, 0]);
+    assert_eq!(counts(&encode_into("one", &["--time-budget", "0.000001", "--threads", "1"])), [1, 0]);
 
     // Kept contributions: another codebook of the same views, without their photos.
     assert_eq!(counts(&encode_into("kept", &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
@@ -67,7 +64,6 @@ fn an_encode_of_some_views_goes_on_with_more() {
 
 /// The summary states the cost of views and cells; threads and resuming do not change it.
 #[nightly("encodes a room three times")]
-#[test]
 fn what_was_spent_is_reported() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = generated(&VIEWS);
@@ -101,8 +97,7 @@ fn what_was_spent_is_reported() {
     encode("second", &[&["--threads", "2"][..], &narrow].concat());
     assert_eq!(content(&dir.path().join("second")), content(&dir.path().join("first")));
 
-    let by_photo = encode("by_photo", &[]);
-    assert_eq!(column(&by_photo, "raster_width_px"), [640.0; 10]);
+    assert_eq!(column(&encode("by_photo", &[]), "raster_width_px"), [640.0; 10]);
 }
 
 /// Photos of a second flight are added and one is withdrawn: only new views are done, and the bytes are those of

@@ -17,6 +17,7 @@ use slag_common::frames::Aabb;
 use slag_common::poses::PoseSource;
 use slag_common::shard::sample::SampleShard;
 use slag_common::shard::{ShardHeader, ShardLayout, sample, section};
+use slag_test_support::assert_error;
 
 #[global_allocator]
 static ALLOCATOR: slag_test_support::CountingAllocator = slag_test_support::CountingAllocator;

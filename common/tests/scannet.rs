@@ -120,8 +120,7 @@ fn damaged_scene_folders_are_named() {
     write(path, "pose/7.txt", "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n");
     refused(path, "its matrix mirrors");
     fs_err::remove_file(path.join("intrinsic/intrinsic_color.txt")).unwrap();
-    let message = poses::read(path, None).unwrap_err().to_string();
-    assert!(message.contains("intrinsic_color.txt"), "{message}");
+    assert_error(poses::read(path, None), &["intrinsic_color.txt"]);
 }
 
 /// Repeats nerfstudio's dataparsers with 4 x 4 matrices: a camera's trained position is the transformed translation.

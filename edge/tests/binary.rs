@@ -30,8 +30,7 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
 
 /// Returns manifest and single shard of a scene of `n_red` red, then blue Gaussians; positions in millimetres.
 fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
-    let text =
-        TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
+    let text = TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).unwrap();
     let vector = |word: &str| text.encode(word).expect("known").to_vec();
     let (centroids, centroid_step) = quantise(&[vector("red"), vector("blue")].concat());
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(10.0) };
@@ -189,10 +188,7 @@ fn a_supervisor_hears_of_start_life_and_stop() {
     let mut serving = serving.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("runs");
     assert_eq!([heard(), heard()], ["READY=1", "WATCHDOG=1"]);
     signal(&serving, "-TERM");
-    assert_eq!(
-        std::iter::repeat_with(heard).find(|word| word != "WATCHDOG=1").as_deref(),
-        Some("STOPPING=1")
-    );
+    assert_eq!(std::iter::repeat_with(heard).find(|word| word != "WATCHDOG=1").unwrap(), "STOPPING=1");
     assert_eq!(serving.wait().expect("ends").code(), Some(0));
 }
 
@@ -269,8 +265,7 @@ fn a_robot_is_followed_by_its_service() {
     let (serving, url) = serve(dir.path(), &["--trust-first", "--follow", &from, "--radius", "20"]);
     assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
     let posted = ureq::post(format!("{url}/position")).content_type("application/json");
-    let posted = posted.send(r#"{"x":1,"y":2,"z":3}"#).expect("an answer");
-    assert_eq!(posted.status().as_u16(), 202);
+    assert_eq!(posted.send(r#"{"x":1,"y":2,"z":3}"#).expect("an answer").status().as_u16(), 202);
     let give_up = Instant::now() + Duration::from_secs(60);
     loop {
         let ((code, answers), (_, status)) =
@@ -329,7 +324,6 @@ fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
 
 /// A sector that gives EIO when the service starts: it listens, names the cell, and answers after the next fetch.
 #[slag_test_support::needs_loop_disk]
-#[test]
 fn a_service_starts_with_a_sector_that_cannot_be_read() {
     let dir = tempfile::tempdir().expect("a folder");
     let disk = slag_test_support::LoopDisk::new(dir.path());

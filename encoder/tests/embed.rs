@@ -28,7 +28,6 @@ fn view(name: &str) -> Labelled {
 }
 
 #[needs_shared]
-#[test]
 fn crops_equal_a_plain_recomputation() {
     let Labelled { photo, labels, masks } = view("0000");
     assert!(masks.len() > 5, "{}", masks.len());
@@ -47,7 +46,6 @@ fn crops_equal_a_plain_recomputation() {
 }
 
 #[needs_shared]
-#[test]
 fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
     let Labelled { photo, masks, .. } = view("0000");
     let library = onnx_runtime();
@@ -61,8 +59,7 @@ fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
     assert_eq!(together.len(), masks.len() * 512);
     for (i, mask) in masks.iter().enumerate() {
         let crop = crop(&photo, mask).expect("it fits");
-        let alone = encoder.encode(&[crop]).expect("it encodes");
-        assert!(alone == together[i * 512..][..512], "mask {i}");
+        assert!(encoder.encode(&[crop]).expect("it encodes") == together[i * 512..][..512], "mask {i}");
     }
     let threes = embed_masks(&photo, &masks, None, &mut *encoder, NonZeroUsize::new(3));
     assert!(threes.expect("it embeds") == together);
@@ -140,6 +137,5 @@ fn masks_that_do_not_fit_are_named() {
         assert!(matches!(error, EmbedError::Mask { index: 1, .. }), "{error}");
         assert!(error.to_string().contains("10x8"), "{error}");
     }
-    let one = crop(&photo, &rectangle(9, 7, 10, 8)).expect("it fits");
-    assert_eq!(one.image().dimensions(), (1, 1));
+    assert_eq!(crop(&photo, &rectangle(9, 7, 10, 8)).expect("it fits").image().dimensions(), (1, 1));
 }

@@ -13,8 +13,7 @@ fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> V
     let input = SegmentInput { view: &view, image, valid, undistorter: None, depth, pool: None };
     let masks = GraphSegmenter::default().segment(&input).unwrap();
     for mask in &masks {
-        let n_inside = mask.inside.count();
-        assert_eq!((n_inside, mask.inside.n_px()), (mask.area_px as usize, box_area(mask)));
+        assert_eq!((mask.inside.count(), mask.inside.n_px()), (mask.area_px as usize, box_area(mask)));
         assert!(mask.box_px.x1 <= width_px && mask.box_px.y1 <= height_px);
     }
     masks
@@ -159,7 +158,6 @@ fn iou_of_masks(a: &Mask, b: &Mask) -> f64 {
 /// Mean best overlap over true instance masks of at least 200 pixels, and number of masks, over eight photos that
 /// were not used to choose the default settings.
 #[needs_shared]
-#[test]
 fn instances_of_real_photos() {
     let scene = shared("scenes/house_a");
     let truth = GivenMasks::open(&scene.join("gt/masks"), Vec::new()).unwrap();

@@ -24,7 +24,7 @@ use slag_encoder::segment::{GivenMasks, SegmentInput, Segmenter};
 use slag_lab::generate::{Scene, grammar};
 use slag_math::random::Random;
 use slag_models::{ModelDir, SessionOptions};
-use slag_test_support::{memory_of, needs_shared, shared};
+use slag_test_support::{assert_error, memory_of, needs_shared, shared};
 
 #[global_allocator]
 static ALLOCATOR: slag_test_support::CountingAllocator = slag_test_support::CountingAllocator;

@@ -8,7 +8,6 @@ use slag_test_support::{needs_shared, onnx_runtime, workspace_root};
 
 /// Also with SAM, whose filters run beside the thread that waits for the model.
 #[needs_shared]
-#[test]
 fn an_encode_leaves_rayons_global_pool_alone() {
     let folder = tempfile::tempdir().expect("a folder");
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool");

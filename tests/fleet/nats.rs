@@ -87,7 +87,6 @@ fn a_folder_and_a_queue_conform() {
 
 /// One worker is killed, one pauses longer than the queue waits; the server is killed half way and restarts empty.
 #[nightly("starts servers, and fails parts of a fleet")]
-#[test]
 fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
     let (fleet, server) = Fleet::new(free_port());
     let flags = ["--ack-wait", "1"];
@@ -115,7 +114,6 @@ fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
 /// Views that kill their worker are given up after too many deliveries and named; the encode uses the others.
 /// Without the queue's limit the next encode does them.
 #[nightly("starts servers, and fails parts of a fleet")]
-#[test]
 fn views_that_end_workers_are_given_up_and_named() {
     let (fleet, _server) = Fleet::new(free_port());
     let flags = ["--ack-wait", "1", "--max-deliver", "1"];
@@ -139,7 +137,6 @@ fn views_that_end_workers_are_given_up_and_named() {
 
 /// Work that takes longer than the queue waits is not delivered again, because its worker reports progress.
 #[nightly("starts servers, and fails parts of a fleet")]
-#[test]
 fn work_in_progress_is_not_handed_out_again() {
     let (fleet, _server) = Fleet::new(free_port());
     // Large rasters: a view takes longer than the queue waits.

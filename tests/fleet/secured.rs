@@ -67,7 +67,6 @@ impl Secured {
 
 /// Each role works with its key; a worker's key cannot fill a queue; unknown keys and authorities can do nothing.
 #[nightly("starts servers, and fails parts of a fleet")]
-#[test]
 fn each_role_has_its_key_and_no_more() {
     let fleet = Secured::start();
     let refused = |mut command: Command, expected: &str| {

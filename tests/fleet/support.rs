@@ -111,8 +111,7 @@ impl Running {
     }
 
     pub fn signal(&mut self, name: &str) {
-        let id = self.id();
-        run(Command::new("kill").args(["-s", name, &id]));
+        run(Command::new("kill").args(["-s", name, &self.id()]));
     }
 
     pub fn output(mut self) -> Output {

@@ -157,9 +157,7 @@ pub fn sources(extension: &str) -> Vec<PathBuf> {
         if !path.is_dir() {
             found.extend(Some(path).filter(|path| path.extension().is_some_and(|of| of == extension)));
         } else if !is_made(&path) {
-            waiting.extend(
-                fs_err::read_dir(path).expect("a folder").map(|entry| entry.expect("readable").path()),
-            );
+            waiting.extend(fs_err::read_dir(path).unwrap().map(|entry| entry.unwrap().path()));
         }
     }
     found.sort();
@@ -184,8 +182,7 @@ impl Service {
         let mut lines = BufReader::new(child.stdout.take().expect("piped")).lines();
         let mut seen = String::new();
         let url = loop {
-            let line =
-                lines.next().unwrap_or_else(|| panic!("ended before it listened: {seen}")).expect("text");
+            let line = lines.next().unwrap_or_else(|| panic!("ended before it listened: {seen}")).unwrap();
             if let Some(at) = line.find("http") {
                 let url = line[at..].split_whitespace().next().expect("a URL");
                 break url.trim_end_matches(['/', ')']).to_owned();
@@ -205,8 +202,7 @@ impl Service {
     }
 
     pub fn get(&self, path: &str) -> Value {
-        let text =
-            ureq::get(format!("{}{path}", self.url)).call().expect("answers").body_mut().read_to_string();
+        let text = ureq::get(format!("{}{path}", self.url)).call().unwrap().body_mut().read_to_string();
         serde_json::from_str(&text.expect("text")).expect("JSON")
     }
 }

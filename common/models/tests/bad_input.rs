@@ -70,7 +70,6 @@ fn wrong_descriptions_are_named_by_field_or_line() {
 }
 
 #[needs_shared]
-#[test]
 fn files_that_do_not_fit_their_description_are_refused() {
     let options = options();
     let vision = ", sha256 = \"e0bca5c7dd0e39ddb0137356acde890cf58930766dccd276ae8242a868f39ae4\"";
@@ -112,7 +111,6 @@ fn files_that_do_not_fit_their_description_are_refused() {
 }
 
 #[needs_shared]
-#[test]
 fn a_tokenizer_of_another_vocabulary_is_refused() {
     let (models, options) = (shared("models"), options());
     let hash = ", sha256 = \"e77528f5a52e0f4b4f98e1b3b4c13453f7762f2e38ec23c9ed352278a65de0a4\"";
@@ -140,7 +138,6 @@ fn a_tokenizer_of_another_vocabulary_is_refused() {
 }
 
 #[needs_shared]
-#[test]
 fn cut_files_are_refused() {
     let (models, options) = (shared("models"), options());
     for (name, path, expected) in [
@@ -190,7 +187,6 @@ fn the_encoder_id_needs_no_files() {
 }
 
 #[needs_shared]
-#[test]
 fn a_hash_that_is_left_out_is_computed_from_the_file() {
     let full = ModelDir::open(&model_dir("conse")).expect("no file is needed");
     let id = full.encoder_id();

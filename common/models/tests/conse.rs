@@ -17,7 +17,6 @@ fn golden_images(golden: &std::path::Path) -> Vec<RgbImage> {
 }
 
 #[needs_shared]
-#[test]
 fn image_vectors_equal_the_recorded_ones_in_any_batch() {
     let (golden, options) = (shared("models/image_encoder/golden.npz"), options());
     let model = ModelDir::open(&model_dir("conse")).expect("it opens");
@@ -43,13 +42,11 @@ fn image_vectors_equal_the_recorded_ones_in_any_batch() {
 }
 
 #[needs_shared]
-#[test]
 fn phrase_vectors_equal_the_file_centred_in_f64() {
     let models = shared("models");
     // No ONNX Runtime is needed: a robot with the text files only.
     let no_runtime = SessionOptions::new("no-such-library.so".into());
-    let mut encoder =
-        ModelDir::open(&model_dir("conse")).expect("it opens").text_encoder(&no_runtime).expect("it loads");
+    let mut encoder = ModelDir::open(&model_dir("conse")).unwrap().text_encoder(&no_runtime).unwrap();
     let bytes = fs_err::read(models.join("clip_text/vectors.safetensors")).expect("it is readable");
     let tensors = SafeTensors::deserialize(&bytes).expect("it parses");
     let mean: Vec<f64> = tensors
@@ -99,11 +96,9 @@ fn phrase_vectors_equal_the_file_centred_in_f64() {
 }
 
 #[needs_shared]
-#[test]
 fn an_unknown_phrase_is_answered_with_near_ones() {
     let no_runtime = SessionOptions::new("no-such-library.so".into());
-    let mut encoder =
-        ModelDir::open(&model_dir("conse")).expect("it opens").text_encoder(&no_runtime).expect("it loads");
+    let mut encoder = ModelDir::open(&model_dir("conse")).unwrap().text_encoder(&no_runtime).unwrap();
     let mut near = |text: &str| match encoder.encode(text) {
         Err(InferenceError::UnknownPhrase { near, n_known: 1612, .. }) => near,
         other => panic!("{text:?}: {other:?}"),
@@ -119,7 +114,6 @@ fn an_unknown_phrase_is_answered_with_near_ones() {
 }
 
 #[needs_shared]
-#[test]
 fn a_photograph_finds_its_words() {
     let (golden, options) = (shared("models/image_encoder/golden.npz"), options());
     let model = ModelDir::open(&model_dir("conse")).expect("it opens");

@@ -25,8 +25,7 @@ fn patches_and_crops_equal_the_recorded_ones() {
 
 #[test]
 fn wrong_patches_are_named() {
-    let description =
-        fs_err::read_to_string(model_dir("dense_tiny").join("model.toml")).expect("it is readable");
+    let description = fs_err::read_to_string(model_dir("dense_tiny").join("model.toml")).unwrap();
     let message = |from: &str, to: &str| {
         let folder = tempfile::tempdir().expect("a folder");
         for name in ["vision.onnx", "phrases.txt", "vectors.safetensors"] {

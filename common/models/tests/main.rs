@@ -19,6 +19,7 @@ use slag_models::preprocess::{Filter, Preprocess, Resize};
 use slag_models::sam::{Letterbox, Sam};
 use slag_models::text::Tokens;
 use slag_models::{Crop, InferenceError, ModelDir, SessionOptions};
+use slag_test_support::assert_error;
 use tempfile::TempDir;
 
 use common::{

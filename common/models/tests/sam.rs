@@ -15,7 +15,6 @@ fn recorded_embedding(golden: &Path, sam: &Sam) -> Embedding {
 }
 
 #[needs_shared]
-#[test]
 fn pixel_values_and_embeddings_equal_the_recorded_ones() {
     let (golden, sam) = open();
     let photo = image(&golden, "image");
@@ -47,7 +46,6 @@ fn size(golden: &Path, name: &str) -> (Vec<usize>, [u32; 2]) {
 }
 
 #[needs_shared]
-#[test]
 fn masks_and_scores_equal_the_recorded_ones() {
     let (golden, sam) = open();
     let embedding = recorded_embedding(&golden, &sam);
@@ -77,11 +75,9 @@ fn masks_and_scores_equal_the_recorded_ones() {
 }
 
 #[needs_shared]
-#[test]
 fn wrong_descriptions_and_files_are_named() {
     let (models, options) = (shared("models"), options());
-    let description =
-        fs_err::read_to_string(model_dir("sam_tiny").join("model.toml")).expect("it is readable");
+    let description = fs_err::read_to_string(model_dir("sam_tiny").join("model.toml")).unwrap();
     let (encoder, decoder) = ("vision_encoder.onnx", "prompt_encoder_mask_decoder.onnx");
     let message = |replacements: &[(&str, &str)], hashes: bool| {
         let folder = tempfile::tempdir().expect("a folder");

@@ -91,8 +91,7 @@ fn weights_beside_the_graph_are_part_of_the_model() {
     assert!(message.contains("[-1, 3, 256, 256], expected f32 [-1, 3, 1024, 1024]"), "{message}");
     // The weights' hashes are in the identity.
     let sam = open();
-    let description =
-        fs_err::read_to_string(model_dir("sam2_tiny").join("model.toml")).expect("it is readable");
+    let description = fs_err::read_to_string(model_dir("sam2_tiny").join("model.toml")).unwrap();
     let hashes: Vec<_> = description.split("sha256 = \"").skip(1).map(|rest| &rest[..64]).collect();
     assert!(hashes.len() == 4 && hashes.iter().all(|hash| sam.id().contains(hash)), "{}", sam.id());
 }

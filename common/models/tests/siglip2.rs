@@ -53,8 +53,7 @@ fn pixel_values_equal_the_processors() {
 
 #[test]
 fn image_vectors_equal_the_recorded_ones() {
-    let (folder, golden) =
-        (tempfile::tempdir().expect("a folder"), model_dir("siglip2_tiny").join("golden.npz"));
+    let (folder, golden) = (tempfile::tempdir().unwrap(), model_dir("siglip2_tiny").join("golden.npz"));
     let mut encoder = pulled(folder.path(), |as_it_is| as_it_is).image_encoder(&options()).expect("it loads");
     let crops: Vec<Crop> = (0..3).map(|k| Crop::whole(image(&golden, &format!("image_{k}")))).collect();
     let found = encoder.encode(&crops).expect("it encodes");

@@ -23,8 +23,7 @@ fn rotations_come_back_within_the_stated_error() {
         worst = worst.max(expected.angle_between(decoded(rotation_code([w, x, y, z]))).to_degrees());
     }
     assert!((0.5..1.9).contains(&worst), "{worst}");
-    let still = decoded(rotation_code([-1.0, 0.0, 0.0, 0.0]));
-    assert!(still.angle_between(DQuat::IDENTITY) < 1e-6);
+    assert!(decoded(rotation_code([-1.0, 0.0, 0.0, 0.0])).angle_between(DQuat::IDENTITY) < 1e-6);
 }
 
 #[test]

@@ -34,8 +34,7 @@ fn text_models_are_optional_and_bounded() {
 
 #[test]
 fn round_trip_and_refusals() {
-    let bytes = manifest(4).to_bytes();
-    assert_eq!(Manifest::parse(&bytes).expect("valid"), manifest(4));
+    assert_eq!(Manifest::parse(&manifest(4).to_bytes()).expect("valid"), manifest(4));
     let unordered = Manifest { cells: manifest(4).cells.into_iter().rev().collect(), ..manifest(0) };
     assert!(matches!(Manifest::parse(&unordered.to_bytes()), Err(ManifestError::Content { .. })));
 }

@@ -143,7 +143,6 @@ mod tests {
             [&head[..], &table, &[0xFF, 0xDA, 0, 8, 1, 1, 0, 0, 63, 0], &[0; 300], &[0xFF, 0xD9]].concat()
         };
         let found = [(0xC0, 1), (0xC0, 0), (0xC2, 1)].map(|(frame, symbol)| damage(&scan(frame, symbol)[..]));
-        let found = found.map(|found| found.expect("memory reads"));
-        assert_eq!(found, [Some(Damage::Zeros), None, None]);
+        assert_eq!(found.map(|found| found.expect("memory reads")), [Some(Damage::Zeros), None, None]);
     }
 }

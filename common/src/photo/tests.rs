@@ -3,6 +3,7 @@ use std::io::Cursor;
 use image::Rgb;
 
 use super::*;
+use slag_test_support::assert_error;
 
 fn written(format: ImageFormat) -> Vec<u8> {
     let mut random = slag_math::random::Random::new(1);
@@ -35,8 +36,7 @@ fn what_is_no_whole_photo_is_named() {
         (b"", "JPEG, PNG or WebP"),
     ];
     for (bytes, expected) in cases {
-        let error = opened(bytes).expect_err(expected).to_string();
-        assert!(error.contains(expected), "{error}");
+        assert_error(opened(bytes), &[expected]);
     }
 }
 

@@ -73,8 +73,7 @@ fn spz_harmonics_turn_with_the_axes() {
         whole.extend(columns.concat());
         let gz = read_well("3.spz", &gzip(&whole));
         let zstd = read_well("4.spz", &spz_v4(degree, &sh, &[]));
-        let bare = read_well("bare.spz", &whole);
-        assert_eq!((&gz, &bare), (&zstd, &zstd));
+        assert_eq!((&gz, &read_well("bare.spz", &whole)), (&zstd, &zstd));
         assert_eq!(gz.means_in_world, [glam::DVec3::new(1.0, -2.0, -3.0)]);
         assert_eq!((gz.sh_degree, gz.opacities[0], gz.scales[0]), (degree.min(3), 1.0, [1.0; 3]));
         assert_eq!(gz.rotations_wxyz, [[1.0, 0.0, 0.0, 0.0]]);
@@ -138,8 +137,7 @@ fn false_counts_are_refused_before_memory_is_reserved() {
     }
     let (mut header, columns) = spz_columns(3, 0, &[]);
     header[8..12].copy_from_slice(&u32::MAX.to_le_bytes());
-    let bytes = gzip(&[header, columns.concat()].concat());
-    refused("a.spz", &bytes, &["Gaussians in", "4294967295"]);
+    refused("a.spz", &gzip(&[header, columns.concat()].concat()), &["Gaussians in", "4294967295"]);
 }
 
 /// Streams that inflate far beyond the table of contents are refused without being held in memory.
@@ -165,8 +163,7 @@ fn zstandard_bombs_are_refused() {
         }
         out.extend(streams.concat());
         let (result, taken) = memory_of(|| read_bytes("bomb.spz", &out));
-        let error = result.expect_err("is refused").to_string();
-        assert!(error.contains("bomb.spz: byte ") && error.contains(expected), "{error}");
+        assert_error(result, &["bomb.spz: byte ", expected]);
         assert!(taken.peak_bytes < 40 << 20, "{taken:?}");
     }
 }
@@ -221,8 +218,7 @@ fn sog_version_1() {
     assert!(read_all(folder.path()).expect("a byte order mark") == found);
     std::fs::write(&path, meta.encode_utf16().flat_map(u16::to_le_bytes).collect::<Vec<u8>>())
         .expect("writes");
-    let refused = read_all(folder.path()).expect_err("another encoding").to_string();
-    assert!(refused.contains("UTF-16, expected UTF-8"), "{refused}");
+    assert_error(read_all(folder.path()), &["UTF-16, expected UTF-8"]);
     for i in 0..6_usize {
         let byte =
             |seed: u8, c: usize| f64::from(seed.wrapping_mul(31).wrapping_add((i * 40 + c * 11) as u8));
@@ -266,8 +262,7 @@ fn sog_counts_take_in_all_gaussians() {
     let path = folder.path().join("meta.json");
     let meta = std::fs::read_to_string(&path).expect("was written");
     std::fs::write(&path, meta.replace("[6, 3]", "[4, 3]")).expect("writes");
-    let error = read_all(folder.path()).expect_err("is refused").to_string();
-    assert!(error.contains("takes in all those of the images, found 4, and more"), "{error}");
+    assert_error(read_all(folder.path()), &["takes in all those of the images, found 4, and more"]);
 }
 
 #[test]
@@ -281,8 +276,7 @@ fn sog_parts_stay_in_their_folder() {
     for outside in ["../sh0.webp", "../inner/../sh0.webp", "sub/../../sh0.webp"] {
         std::fs::create_dir_all(inner.join("sub")).expect("the temporary folder can be written");
         std::fs::write(inner.join("meta.json"), meta.replace("sh0.webp", outside)).expect("writes");
-        let error = read_all(&inner).expect_err("is refused").to_string();
-        assert!(error.contains("plain file names") && error.contains(outside), "{error}");
+        assert_error(read_all(&inner), &["plain file names", outside]);
     }
 }
 
@@ -294,8 +288,7 @@ fn sog_labels_and_codebooks_out_of_range() {
     write_webp(&path.join("labels.webp"), 3, &[[127, 0, 0, 255]; 6]);
     assert_eq!(read_all(path).unwrap_or_else(|e| panic!("{e}")).sh_degree, 1);
     write_webp(&path.join("labels.webp"), 3, &[[128, 0, 0, 255]; 6]);
-    let error = read_all(path).expect_err("is refused").to_string();
-    assert!(error.contains("shN: expected labels below 128, found 128"), "{error}");
+    assert_error(read_all(path), &["shN: expected labels below 128, found 128"]);
 
     // Version 2 with a codebook null, 1, ... 255 (PlayCanvas takes 1 + (1 - 255) / 255 for null), and a short one.
     let numbers = |n: usize| (1..n).map(|i| i.to_string()).collect::<Vec<_>>().join(",");

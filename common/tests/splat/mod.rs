@@ -10,7 +10,7 @@ use std::path::Path;
 
 use slag_common::Gaussians;
 use slag_common::splat::{ReadOptions, SplatError, read};
-use slag_test_support::{needs_shared, shared};
+use slag_test_support::{assert_error, needs_shared, shared};
 
 use generated::gzip;
 

@@ -126,11 +126,9 @@ fn freeze_with_a_clock_that_was_set_back() {
     let mut repo = Repo::new();
     let mut late = repo.clone();
     late.expires = EXPIRES * 2;
-    let snapshot = FileMeta::of(1, &late.files["1.snapshot.json"]);
-    late.sign_timestamp_as(2, snapshot, EXPIRES + 1);
+    late.sign_timestamp_as(2, FileMeta::of(1, &late.files["1.snapshot.json"]), EXPIRES + 1);
     let mut kept = client(&repo);
-    let error =
-        refresh(&mut kept, &mut late, 0).expect_err("a root that had expired when the timestamp was signed");
+    let error = refresh(&mut kept, &mut late, 0).unwrap_err();
     assert!(matches!(error, TufError::Expired { .. }) && role_of(&error) == "root", "{error}");
     // A refused timestamp does not move the clock of its client.
     let mut trusted = slag_common::tuf::Trusted::new(repo.root(), NOW).expect("a root");
@@ -212,7 +210,7 @@ fn wrong_keys() {
 #[test]
 fn a_threshold_counts_keys() {
     let mut repo = Repo::new();
-    let owner = Owner { root: vec![key(1)], root_threshold: 2, ..Owner::new() };
+    let owner = Owner { root: vec![key(1)], root_threshold: 2, ..Owner::default() };
     assert!(matches!(
         Kept::from_root(&owner.sign_root(1, EXPIRES, &[])),
         Err(TufError::Signatures { found: 1, threshold: 2, .. })
@@ -220,8 +218,7 @@ fn a_threshold_counts_keys() {
     let mut body = owner.root_body();
     body.keys.insert("alias".into(), Key::of(&key(1)));
     body.roles.get_mut("root").expect("there").keyids.push("alias".into());
-    let mut twice: serde_json::Value =
-        serde_json::from_slice(&sign(1, EXPIRES, &body, &[&key(1)])).expect("JSON");
+    let mut twice: serde_json::Value = serde_json::from_slice(&sign(1, EXPIRES, &body, &[&key(1)])).unwrap();
     let mut signature = twice["signatures"][0].clone();
     let signatures = twice["signatures"].as_array_mut().expect("a list");
     signature["keyid"] = "alias".into();

@@ -5,7 +5,7 @@ use super::*;
 use super::repo::*;
 
 fn others() -> Owner {
-    Owner { root: vec![key(11), key(12), key(13)], ..Owner::new() }
+    Owner { root: vec![key(11), key(12), key(13)], ..Owner::default() }
 }
 
 #[test]
@@ -16,7 +16,7 @@ fn a_root_needs_the_old_keys_and_its_own() {
         offered.put(&format!("{version}.root.json"), bytes);
         update(&mut client(&repo), &mut offered)
     };
-    let old = Owner::new().root;
+    let old = Owner::default().root;
     offer(others().sign_root(2, EXPIRES, &old), 2).expect("old and new keys");
     offer(others().sign_root(2, EXPIRES, &old[1..]), 2).expect("a threshold of the old keys");
     let error = offer(others().sign_root(2, EXPIRES, &old[2..]), 2).expect_err("one old key");
@@ -69,8 +69,7 @@ fn fast_forward_is_made_good_by_a_new_root() {
         let top = u64::MAX - 1;
         match taken {
             "timestamp" => {
-                let meta = FileMeta::of(1, &repo.files["1.snapshot.json"]);
-                repo.sign_timestamp_as(top, meta, NOW);
+                repo.sign_timestamp_as(top, FileMeta::of(1, &repo.files["1.snapshot.json"]), NOW);
             }
             "snapshot" => {
                 let meta = FileMeta::of(1, &repo.files["1.targets.json"]);
@@ -99,8 +98,7 @@ fn a_signed_time_in_the_future_is_made_good_by_a_new_root() {
     let mut kept = updated(&mut repo);
     let honest = repo.clone();
     repo.expires = u64::MAX / 2;
-    let meta = FileMeta::of(1, &repo.files["1.snapshot.json"]);
-    repo.sign_timestamp_as(2, meta, EXPIRES - 1);
+    repo.sign_timestamp_as(2, FileMeta::of(1, &repo.files["1.snapshot.json"]), EXPIRES - 1);
     update(&mut kept, &mut repo).expect("not yet expired");
     assert_eq!(kept.signed_unix_secs(), Some(EXPIRES - 1));
     let mut repo = honest;
@@ -146,7 +144,7 @@ fn online_keys_cannot_name_keys() {
 
 #[test]
 fn roots_that_ask_for_nothing_are_refused() {
-    let owner = Owner::new();
+    let owner = Owner::default();
     let good = owner.root_body();
     let refused = |change: &dyn Fn(&mut slag_common::tuf::Root)| {
         let mut body = good.clone();

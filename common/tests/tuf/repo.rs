@@ -23,12 +23,14 @@ pub struct Owner {
     pub timestamp: SigningKey,
 }
 
-impl Owner {
-    pub fn new() -> Self {
+impl Default for Owner {
+    fn default() -> Self {
         let root = vec![key(1), key(2), key(3)];
         Self { root, root_threshold: 2, targets: key(4), snapshot: key(5), timestamp: key(6) }
     }
+}
 
+impl Owner {
     pub fn root_body(&self) -> Root {
         let mut keys = BTreeMap::new();
         let mut role = |signers: &[SigningKey], threshold| {
@@ -52,7 +54,7 @@ impl Owner {
 }
 
 /// Files of a repository; records what was read.
-#[derive(Clone)]
+#[derive(Clone, Default)]
 pub struct Repo {
     pub owner: Owner,
     pub files: BTreeMap<String, Vec<u8>>,
@@ -66,17 +68,7 @@ pub struct Repo {
 impl Repo {
     /// All roles at version 1.
     pub fn new() -> Self {
-        let (files, reads) = (BTreeMap::new(), Vec::new());
-        let (root_version, version, timestamp_version) = (1, 0, 0);
-        let mut repo = Self {
-            owner: Owner::new(),
-            files,
-            root_version,
-            version,
-            timestamp_version,
-            expires: EXPIRES,
-            reads,
-        };
+        let mut repo = Self { root_version: 1, expires: EXPIRES, ..Self::default() };
         repo.put("1.root.json", repo.owner.sign_root(1, EXPIRES, &[]));
         repo.publish(b"one");
         repo

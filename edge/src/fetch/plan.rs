@@ -139,6 +139,7 @@ mod tests {
     use proptest::prelude::*;
     use slag_common::frames::{Aabb, GeoReference, Geographic};
     use slag_common::shard::sample;
+    use slag_test_support::assert_error;
 
     use super::super::position::Position;
     use super::*;
@@ -273,11 +274,9 @@ mod tests {
             height_m: None,
         };
         for place in [at(90.1, 0.0), at(f64::NAN, 0.0), at(0.0, -180.5), Position::World(DVec3::NAN)] {
-            let error = place.in_world(&good).expect_err("no place").to_string();
-            assert!(error.contains(", expected within "), "{place:?}: {error}");
+            assert_error(place.in_world(&good), &[", expected within "]);
         }
         let nowhere = Manifest { geo_reference: None, ..good };
-        let error = at(46.8, -91.9).in_world(&nowhere).expect_err("nowhere").to_string();
-        assert!(error.contains("has no geo-reference"), "{error}");
+        assert_error(at(46.8, -91.9).in_world(&nowhere), &["has no geo-reference"]);
     }
 }

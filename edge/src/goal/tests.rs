@@ -130,11 +130,7 @@ fn what_is_walled_off_is_unreachable() {
     // With a door of 0.8 m it is reached, with one of 0.5 m it is not.
     let door = |half: f64| move |p: DVec3| wall(p).filter(|_| (p.y - 5.0).abs() > half);
     let found = goals(door(0.4)).expect("poses");
-    assert!(
-        found[0].path_m > START.distance(DVec3::new(1.5, 5.0, 0.0)),
-        "by way of the door: {:?}",
-        found[0]
-    );
+    assert!(found[0].path_m > START.distance(DVec3::new(1.5, 5.0, 0.0)), "through the door: {:?}", found[0]);
     assert_eq!(goals(door(0.25)), Err(NoGoal::Unreachable));
 }
 
@@ -181,8 +177,7 @@ fn nothing_is_seen_through_what_a_thing_stands_on() {
     let world = packed(no_box);
     let on_board: Vec<DVec3> = points().into_iter().map(|p| p + DVec3::Z * 0.6).collect();
     let request = asked(|_| {});
-    let found = stand(&world, &request, START, &on_board);
-    assert_eq!(found, Err(NoGoal::NotVisible));
+    assert_eq!(stand(&world, &request, START, &on_board), Err(NoGoal::NotVisible));
     // A thing that hangs there is seen from below.
     let empty = packed(|p: DVec3| match no_box(p) {
         At::Solid if p.z > 0.0 => At::Free,
@@ -209,8 +204,7 @@ fn what_hangs_on_a_wall_is_seen_from_below() {
     let bump =
         |p: DVec3| wall(p).or_else(|| inside(p, [4.7, 2.0, 0.75], [4.9, 4.0, 0.85]).then_some(At::Solid));
     let world = packed(hall(bump));
-    let found = stand(&world, &request, START, &on_wall);
-    assert_eq!(found, Err(NoGoal::NotVisible));
+    assert_eq!(stand(&world, &request, START, &on_wall), Err(NoGoal::NotVisible));
 }
 
 /// A pole behind a screen with a slit of one voxel is seen from a strip of 10 cm; the cheapest place of its
@@ -266,8 +260,7 @@ fn steps_and_slopes_count() {
     goals(threshold(0.05)).expect("poses");
     assert_eq!(goals(threshold(0.15)), Err(NoGoal::Unreachable));
     let world = packed(hall(threshold(0.15)));
-    let request = asked(|r| r.robot.step_m = Some(0.2));
-    goals_with(&world, &request).expect("a robot that climbs 20 cm");
+    goals_with(&world, &asked(|r| r.robot.step_m = Some(0.2))).expect("a robot that climbs 20 cm");
     // A slope with a ramp on both sides.
     let hill = |p: DVec3| (p.z < (0.5 - (p.x - 1.8).abs()).max(0.0) * 0.6).then_some(At::Solid);
     goals(hill).expect("over the hill");
@@ -279,8 +272,7 @@ fn tables_are_driven_under_or_around() {
     let table = |p: DVec3| inside(p, [1.4, 0.0, 0.65], [2.0, 6.0, 0.7]).then_some(At::Solid);
     let world = packed(hall(table));
     goals_with(&world, &asked(|_| {})).expect("below the table");
-    let high = asked(|r| r.robot.height_m = Some(0.9));
-    assert_eq!(goals_with(&world, &high), Err(NoGoal::Unreachable));
+    assert_eq!(goals_with(&world, &asked(|r| r.robot.height_m = Some(0.9))), Err(NoGoal::Unreachable));
 }
 
 /// The robot's position is a little inside a coffee table, by its edge: the top is ground with room above and
@@ -330,8 +322,7 @@ fn steep_ramps_are_not_driven() {
     goals(ridge(0.3)).expect("over a gentle one");
     assert_eq!(goals(ridge(0.95)), Err(NoGoal::Unreachable), "43 degrees");
     let world = packed(hall(ridge(0.95)));
-    let able = asked(|r| r.robot.slope = 1.2);
-    goals_with(&world, &able).expect("a robot that climbs");
+    goals_with(&world, &asked(|r| r.robot.slope = 1.2)).expect("a robot that climbs");
 }
 
 /// A step too small to show in the voxels is refused.
@@ -356,8 +347,7 @@ fn steps_below_the_voxels_are_refused() {
     assert!(refused(0.2, None).is_some());
     // In voxels of 10 cm the same hall has poses.
     let world = packed_in(0.1, -0.4, hall(|_| None));
-    let request = asked(|r| r.robot.step_m = Some(0.15));
-    goals_with(&world, &request).expect("poses");
+    goals_with(&world, &asked(|r| r.robot.step_m = Some(0.15))).expect("poses");
 }
 
 #[test]

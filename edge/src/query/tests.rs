@@ -139,10 +139,7 @@ fn neither_threshold_nor_voxel_changes_the_order() {
         clusters(&answers).iter().map(key).collect::<Vec<_>>()
     };
     let all = asked(0.2, 0.25, 1);
-    assert_eq!(
-        all.iter().map(|(id, _)| id.as_str()).collect::<Vec<_>>(),
-        ["4-0", "6-0", "5-0", "3-0", "7-0"]
-    );
+    assert_eq!(all.iter().map(|(id, _)| &**id).collect::<Vec<_>>(), ["4-0", "6-0", "5-0", "3-0", "7-0"]);
     for (threshold, n_left) in [(0.5, 4), (0.69, 4), (0.85, 3), (0.94, 1)] {
         for voxel in [0.05, 0.25, 1.0] {
             let left = asked(threshold, voxel, 1);
@@ -178,8 +175,7 @@ fn empty_answers_say_why() {
     let reason = nothing.reason.expect("nothing there");
     assert_eq!((reason.kind, reason.best_score), (ReasonKind::NothingThere, None));
     assert_eq!(nothing.coverage.area_fetched, Some(false));
-    let sticking_out = ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0));
-    assert_eq!(sticking_out.coverage.area_fetched, Some(false));
+    assert_eq!(ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0)).coverage.area_fetched, Some(false));
     let gaussians =
         ask(&yard, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(1.0)));
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);

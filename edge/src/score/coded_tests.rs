@@ -95,10 +95,7 @@ fn scores_are_within_the_stated_error() {
                             _ => bound - search.steepness * shard.radii[centroid],
                         };
                         let share = rounding / f64::from(of_rounding);
-                        assert!(
-                            (found - truth).abs() <= f64::from(bound),
-                            "{shape:?} {found} {truth} {bound}"
-                        );
+                        assert!((found - truth).abs() <= f64::from(bound), "{shape:?} {found} {truth}");
                         assert!(share <= 1.0, "{shape:?} {precision:?} {rounding} {of_rounding}");
                         largest_share = largest_share.max(share);
                         let (lower, upper) = cell.bounds(centroid);

@@ -38,8 +38,7 @@ fn going_to_and_fro_over_an_edge_costs_one_fetch() {
         let fetched_at = (0..200).filter(|second| drive(&mut robot, &mut follower, *second, x(*second)));
         assert_eq!(fetched_at.collect::<Vec<_>>(), [0], "edge at {edge}");
         let seen = server.take_seen();
-        let n_timestamps = seen.iter().filter(|seen| seen.path.contains("timestamp")).count();
-        assert_eq!(n_timestamps, 1, "{seen:?}");
+        assert_eq!(seen.iter().filter(|seen| seen.path.contains("timestamp")).count(), 1, "{seen:?}");
     }
 }
 

@@ -58,8 +58,7 @@ fn changes_are_told_where_both_generations_are_known() {
     // After it leaves, what it knew of both generations is still compared; what it knew of one alone is not.
     robot.go(55.0, 14.0, &after(), 4..7);
     robot.fetch().expect("works");
-    let on_board = cells(&robot.snapshot());
-    assert_eq!(on_board, [4, 5, 6], "the cells left behind are gone");
+    assert_eq!(cells(&robot.snapshot()), [4, 5, 6], "the cells left behind are gone");
     assert_changed(&robot, "from elsewhere");
     assert_eq!(changes(&robot, Some(1)).expect("a reply").n_not_compared, 1, "10");
     // Generations that it never had are refused by name.

@@ -28,7 +28,6 @@ fn trial() -> Trial {
 
 /// Read through the map, the sector would end this process with SIGBUS.
 #[needs_loop_disk]
-#[test]
 fn a_sector_that_cannot_be_read_costs_its_cell_and_is_fetched_again() {
     let Trial { disk, scene, robot, .. } = &trial();
     disk.break_block(&robot.cache.shard_path(scene.hash(1, Profile::Compact)), BLOCK);
@@ -41,7 +40,6 @@ fn a_sector_that_cannot_be_read_costs_its_cell_and_is_fetched_again() {
 
 /// Either reader may meet the sector first: the record of leaving objects, or the scrub.
 #[needs_loop_disk]
-#[test]
 fn fetches_and_scrubs_read_and_do_not_map() {
     let Trial { disk, server, scene, robot, .. } = &trial();
     disk.break_block(&robot.cache.shard_path(scene.hash(1, Profile::Compact)), BLOCK);
@@ -57,7 +55,6 @@ fn fetches_and_scrubs_read_and_do_not_map() {
 
 /// ext4 neither reads, removes nor replaces it: the cell is missing until the disk is checked; the others go on.
 #[needs_loop_disk]
-#[test]
 fn an_inode_that_cannot_be_read_fails_no_fetch() {
     let Trial { disk, server, scene, robot, .. } = &trial();
     disk.break_inode(&robot.cache.shard_path(scene.hash(1, Profile::Compact)));

@@ -35,7 +35,7 @@ use slag_edge::query::Engine;
 use slag_edge::store::files::Files;
 use slag_edge::store::{BadCell, CellFault, EdgeCache, Scrubber, Snapshot, StoreError};
 use slag_math::random::Random;
-use slag_test_support::trials;
+use slag_test_support::{assert_error, trials};
 
 use faults::text_service;
 use scene::{ENCODER, FIRST, NOW, Published, RootKeys};

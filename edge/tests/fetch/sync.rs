@@ -12,10 +12,8 @@ fn the_second_fetch_brings_only_the_difference() {
     let report = robot.fetch().expect("works");
     assert_eq!((report.n_cells, report.downloaded.n_shards, report.kept.n_shards), (3, 3, 0));
     assert_eq!(report.downloaded.bytes, first.bytes(0..3));
-    assert_eq!(
-        server.take_objects().iter().map(|seen| seen.body_bytes as u64).sum::<u64>(),
-        first.bytes(0..3)
-    );
+    let n_sent: usize = server.take_objects().iter().map(|seen| seen.body_bytes).sum();
+    assert_eq!(n_sent as u64, first.bytes(0..3));
     assert!(report.is_first_contact && report.root_version == 1 && report.generation == 1);
     assert_holds(&robot.snapshot(), &first, 0..3);
     let stat = robot.cache.current_stat().expect("readable");
@@ -62,8 +60,7 @@ fn the_least_recently_used_are_freed_first() {
     let error = robot.fetch().expect_err("too large").to_string();
     assert!(error.starts_with("the 1 cells need "), "{error}");
     robot.request.at = Some(at(500.0));
-    let error = robot.fetch().expect_err("far away").to_string();
-    assert!(error.contains("the nearest is 420.0 away"), "{error}");
+    assert_error(robot.fetch(), &["the nearest is 420.0 away"]);
     assert_holds(&robot.snapshot(), &scene, 3..4);
 }
 
@@ -117,8 +114,7 @@ fn passing_faults_are_overcome() {
                 false => Fault::None,
             }
         });
-        let report = robot.fetch().unwrap_or_else(|e| panic!("{fault:?}: {e}"));
-        assert_eq!(report.retries, 3, "{fault:?}");
+        assert_eq!(robot.fetch().unwrap_or_else(|e| panic!("{fault:?}: {e}")).retries, 3, "{fault:?}");
         assert_holds(&robot.snapshot(), &scene, 0..3);
         let second: usize = server.take_objects().iter().filter(|seen| seen.range_start.is_some()).count();
         assert!(is_retry_cheap || second == 0, "{fault:?}: damaged bytes are not resumed");
@@ -221,8 +217,7 @@ fn a_shard_that_the_manifest_does_not_describe_is_refused() {
         let spec =
             super::scene::ShardSpec { cell_id, content: 0, n_gaussians: 100, encoder, is_exact: false };
         fs_err::write(&path, super::scene::shard(&spec)).expect("written");
-        let error = Snapshot::open(&robot.cache).expect_err("another shard").to_string();
-        assert!(error.contains(expected), "{error}");
+        assert_error(Snapshot::open(&robot.cache), &[expected]);
     }
 }
 

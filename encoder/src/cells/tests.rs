@@ -13,8 +13,7 @@ proptest! {
         mut means in prop::collection::vec(prop::array::uniform3(-100.0..100.0f64), 1..2000),
         max_gaussians in 1usize..300, max_width in 5.0..50.0f64, repeat in 0usize..400,
     ) {
-        let first = means[0];
-        means.extend(std::iter::repeat_n(first, repeat));
+        means.extend(std::iter::repeat_n(means[0], repeat));
         means.push([f64::NAN, 0.0, 0.0]);
         let scene = scene(&means, 0.5);
         let limits = CellLimits { max_width: Some(max_width), ..CellLimits::by_count(max_gaussians) };

@@ -197,10 +197,7 @@ fn most_views_must_fit() {
     assert_eq!(far_below(&[(31.0, 14.0), (15.9, 13.8), (33.0, 14.0)]), [false, true, false]);
     assert_eq!(far_below(&[(31.0, 14.0), (24.0, 14.0), (18.0, 14.0)]), [false; 3]);
     assert_eq!(far_below(&[(31.0, 14.0), (38.0, 36.0), (24.0, 22.0)]), [false; 3]);
-    assert_eq!(
-        far_below(&[(36.0, 14.0), (24.0, 14.0), (23.0, 14.0), (23.0, 14.0), (24.0, 14.0)]),
-        [false; 5]
-    );
+    assert_eq!(far_below(&[36.0, 24.0, 23.0, 23.0, 24.0].map(|db| (db, 14.0))), [false; 5]);
 }
 
 /// Advice is that of what the drawings confirmed.

@@ -354,13 +354,13 @@ fn identity(path: &Path) -> Option<(u64, u64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slag_test_support::assert_error;
 
     #[test]
     fn a_wrong_time_to_sign_is_refused() {
         assert_eq!(parse_epoch(OsStr::new("1700000000")).expect("seconds"), 1_700_000_000);
         for wrong in ["", "yesterday", "-1", "1.5"] {
-            let error = parse_epoch(OsStr::new(wrong)).expect_err("is refused").to_string();
-            assert!(error.contains("expected seconds since 1970"), "{error}");
+            assert_error(parse_epoch(OsStr::new(wrong)), &["expected seconds since 1970"]);
         }
     }
 
@@ -380,12 +380,10 @@ mod tests {
         let (scene, photos, store) = (at("in.ply"), at("photos"), at("store"));
         let check = |output: &str| check([&*at(output)], &[&scene, &photos], Some(&store));
         for output in ["in.ply", "hard.ply", "photos", "photos/a.JPG", "photos/../in.ply"] {
-            let error = check(output).expect_err(output).to_string();
-            assert!(error.contains("would replace what is read"), "{error}");
+            assert_error(check(output), &["would replace what is read"]);
         }
         for output in ["store", "store/manifest", "link/new/deep.html"] {
-            let error = check(output).expect_err(output).to_string();
-            assert!(error.contains("would lie in the store"), "{error}");
+            assert_error(check(output), &["would lie in the store"]);
         }
         for output in ["new.ply", "photos/new.png", "photos/report.html", "photos/drawn"] {
             check(output).expect(output);

@@ -191,8 +191,7 @@ mod tests {
     /// A bucket or database that hangs up breaks a pipe, too, and that is a failure.
     #[test]
     fn only_the_reader_of_stdout_may_leave() {
-        let of_network = io::Error::from(io::ErrorKind::BrokenPipe);
-        assert_eq!(exit_of(Err(of_network.into()), false), Exit::Failed);
+        assert_eq!(exit_of(Err(io::Error::from(io::ErrorKind::BrokenPipe).into()), false), Exit::Failed);
         assert_eq!(exit_of(Err(ReaderGone.into()), false), Exit::Done);
     }
 

@@ -112,10 +112,7 @@ fn bounds_and_errors_are_those_of_what_readers_decode() {
             };
             if n_errors > 0 {
                 let mean = error_sum / n_errors as f64;
-                assert!(
-                    (f64::from(errors.mean) - mean).abs() < 1e-3 * mean + 1e-6,
-                    "{dim}: {errors:?} {mean}"
-                );
+                assert!((f64::from(errors.mean) - mean).abs() < 1e-3 * mean + 1e-6, "{errors:?} {mean}");
                 assert!((f64::from(errors.max) - error_max).abs() < 1e-3 * error_max + 1e-6);
             }
             means.push(errors.mean);

@@ -438,6 +438,7 @@ mod tests {
     use std::path::{Path, PathBuf};
 
     use slag_models::{ModelDir, Provider, SessionOptions};
+    use slag_test_support::assert_error;
 
     use super::*;
     use crate::cells::CellSplit;
@@ -448,8 +449,7 @@ mod tests {
     #[test]
     fn a_scene_of_too_many_cells_is_refused() {
         assert!(check_cells(65_536).is_ok());
-        let error = check_cells(65_537).expect_err("is refused").to_string();
-        assert!(error.contains("--cell-gaussians and --cell-width-m"), "{error}");
+        assert_error(check_cells(65_537), &["--cell-gaussians and --cell-width-m"]);
     }
 
     /// By hand: a camera with a photo of 400 x 300 px, absent, and two of 40 x 30 by their headers. Two are in work, 19

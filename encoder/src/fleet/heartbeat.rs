@@ -84,6 +84,7 @@ impl HeartbeatWatch {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slag_test_support::assert_error;
 
     /// After a wait, a new beat is accepted; the same one is given up on.
     #[test]
@@ -103,7 +104,6 @@ mod tests {
         bucket.put(&run.heartbeat_key(), "another").expect("puts");
         watch.check(&bucket).expect("a new beat");
         std::thread::sleep(2 * patience);
-        let error = watch.check(&bucket).expect_err("the same beat").to_string();
-        assert!(error.contains("run 3") && error.contains("start the same encode again"), "{error}");
+        assert_error(watch.check(&bucket), &["run 3", "start the same encode again"]);
     }
 }

@@ -187,8 +187,7 @@ fn parts_of_a_cell_make_the_cell() {
         let mut embeddings = vec![0.0; locals.len() * 5];
         CellField::new(locals.map(|k| k as u32).collect(), contributions, &table, &mut embeddings)
     };
-    let mut parts =
-        index.transpose(&index.read(0..3).expect("reads"), &table).expect("transposes").into_iter();
+    let mut parts = index.transpose(&index.read(0..3).unwrap(), &table).unwrap().into_iter();
     let mut joined = field(parts.next().expect("a part"));
     parts.for_each(|contributions| joined.append(field(contributions)));
     assert_eq!(joined, field(transpose(&whole, 0).remove(0)));
@@ -252,8 +251,7 @@ fn foreign_files_are_refused() {
         vec![(0, vec![Contribution { local: 4095, region: MAX_REGIONS as u32 - 1, weight: 1.0 }])];
     view.write(&path).expect("writes");
     let (index, table) = ContributionIndex::open(&[path], 1, &[4096]).expect("opens");
-    let contributions =
-        index.transpose(&index.read(0..1).expect("reads"), &table).expect("transposes").remove(0);
+    let contributions = index.transpose(&index.read(0..1).unwrap(), &table).unwrap().remove(0);
     assert_eq!(
         (contributions.regions, contributions.starts[4095..].to_vec()),
         (vec![MAX_REGIONS as u32 - 1], vec![0, 1])

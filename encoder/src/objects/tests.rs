@@ -6,6 +6,7 @@ use slag_common::Gaussians;
 use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 use slag_math::random::Random;
+use slag_test_support::assert_error;
 
 use super::shards::{CellObjects, CentroidBasis};
 use super::tree::Evidence;
@@ -188,8 +189,7 @@ fn what_no_photo_shows_whole_is_no_object() {
 
 #[test]
 fn a_search_can_be_cancelled() {
-    let found = world().objects_of(None, u64::MAX, true);
-    assert!(matches!(found, Err(ContributionError::Cancelled)));
+    assert!(matches!(world().objects_of(None, u64::MAX, true), Err(ContributionError::Cancelled)));
 }
 
 /// By hand: two isolated pieces at the ends of a row, and in two views one mask over both, each with an intersection
@@ -302,8 +302,7 @@ fn lists_are_reserved() {
         plan.rest(0)
     };
     assert_eq!(rest(480, 100), Ok(0));
-    let refused = rest(479, 100).expect_err("a byte is missing").to_string();
-    assert!(refused.contains("480 for masks of superpoints"), "{refused}");
+    assert_error(rest(479, 100), &["480 for masks of superpoints"]);
 }
 
 mod definition;

@@ -87,8 +87,7 @@ fn a_refresh_keeps_clients_and_needs_no_root_key() {
         Metadata::open(dir.path()).and_then(|metadata| metadata.refresh(NOW, 1)),
         Err(StoreError::NotPublished { .. })
     ));
-    let store = Store::create_or_open(dir.path()).expect("opens");
-    publish(&store, 1, NOW);
+    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, NOW);
     let mut kept = client(dir.path());
     fs_err::remove_dir_all(dir.path().join("keys/root")).expect("there");
     let later = NOW + 31 * DAY;
@@ -113,8 +112,7 @@ fn an_expired_root_is_warned_of_and_renewed() {
     let metadata = Metadata::open(dir.path()).expect("opens");
     metadata.make_root(&default_root_folder(dir.path()), 1, 1, 0).expect("makes");
     drop(metadata);
-    let store = Store::create_or_open(dir.path()).expect("opens");
-    publish(&store, 1, NOW);
+    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, NOW);
     let mut kept = client(dir.path());
     let is_refused = |kept: &mut Kept| matches!(follow(kept, dir.path(), NOW), Err(TufError::Expired { .. }));
     assert!(is_refused(&mut kept));
@@ -187,8 +185,7 @@ fn role_keys_are_private() {
     let (dir, _store) = published(NOW);
     for name in ["root/1", "targets", "snapshot", "timestamp"] {
         let path = dir.path().join("keys").join(format!("{name}.key"));
-        let mode = fs_err::metadata(path).expect("there").permissions().mode();
-        assert_eq!(mode & 0o777, 0o600, "{name}");
+        assert_eq!(fs_err::metadata(path).expect("there").permissions().mode() & 0o777, 0o600, "{name}");
     }
 }
 

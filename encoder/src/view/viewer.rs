@@ -226,6 +226,7 @@ pub(crate) fn up_of(views: &[View]) -> Option<Vec3> {
 mod tests {
     use glam::{DAffine3, DMat3};
     use slag_common::Gaussians;
+    use slag_test_support::assert_error;
 
     use super::*;
     use crate::store;
@@ -255,15 +256,13 @@ mod tests {
             let store = Some(dir.path().to_owned());
             Viewer::new(Viewed { store, splat, views: Vec::new(), up: None, open_text }).check()
         };
-        let missing = check(None).expect_err("nothing there").to_string();
-        assert!(missing.contains("nothing has been published here yet"), "{missing}");
+        assert_error(check(None), &["nothing has been published here yet"]);
         let store = store::Store::create_or_open(dir.path()).expect("opens");
         store.publish(&store::tests::manifest(1, &[]), &store::Extras::new()).expect("publishes");
         check(None).expect("a store");
-        let other = check(Some(7)).expect_err("another splat").to_string();
-        assert!(
-            other.contains("the splat has 7 Gaussians, but the store was encoded from one with 0"),
-            "{other}"
+        assert_error(
+            check(Some(7)),
+            &["the splat has 7 Gaussians, but the store was encoded from one with 0"],
         );
     }
 

@@ -34,7 +34,6 @@ fn run(scene: &Gaussians, views: &[CheckView], options: &CheckOptions) -> CheckR
 }
 
 #[needs_shared]
-#[test]
 fn a_scene_that_fits_its_photos_passes() {
     let root = shared("scenes/brighton");
     let scene = read_scene(&root);
@@ -68,7 +67,6 @@ fn a_splat_without_a_sky_fits_its_photos() {
 
 /// Plants each mistake as the inverse of its correction, written independently.
 #[needs_shared]
-#[test]
 fn planted_mistakes_are_diagnosed() {
     let root = shared("scenes/brighton");
     let scene = read_scene(&root);
@@ -141,8 +139,7 @@ fn planted_mistakes_are_diagnosed() {
     assert_eq!(diagnosed(&scene, &y_up), Some(Mistake::WorldAxes([1, -3, 2])));
 
     let upside_down = |view: &mut RasterView| {
-        let m = DAffine3::from_rotation_z(std::f64::consts::PI);
-        view.camera_from_world = m * view.camera_from_world;
+        view.camera_from_world = DAffine3::from_rotation_z(std::f64::consts::PI) * view.camera_from_world;
     };
     assert_eq!(diagnosed(&scene, &upside_down), Some(Mistake::UpsideDown));
 
@@ -195,7 +192,6 @@ fn tiny_view() -> CheckView {
 
 /// Faults visible in the data alone: each planted by hand, with the correction that the drawings confirm.
 #[needs_shared]
-#[test]
 fn faults_of_the_data_are_suspected_and_confirmed() {
     let root = shared("scenes/brighton");
     let scene = read_scene(&root);

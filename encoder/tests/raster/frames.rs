@@ -42,7 +42,6 @@ impl House {
 
 #[nightly("checks the house eight times")]
 #[needs_shared]
-#[test]
 fn moved_splats_are_brought_back() {
     let house = House::read();
     assert_eq!(house.check(&Similarity::IDENTITY, Vec::new()).diagnosis, None);
@@ -85,7 +84,6 @@ fn moved_splats_are_brought_back() {
 
 #[nightly("checks a scene many times")]
 #[needs_shared]
-#[test]
 fn other_axes_and_scales_are_named() {
     let house = House::read();
     // COLMAP's world against nerfstudio's.

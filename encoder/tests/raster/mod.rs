@@ -26,6 +26,7 @@ use slag_encoder::raster::{
     CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights,
 };
 use slag_math::random::Random;
+use slag_test_support::assert_error;
 
 use backends::Backend;
 use fixtures::{needs_shared, photo, read_splat, shared, shrunk};

@@ -1,7 +1,7 @@
 //! Shared by tests of several crates: test data beside the project, and an allocator that counts.
 //!
 //! Scenes and models that are too large for the repository are in `../shared`, or in the folder `SLAG_SHARED`.
-//! Mark tests that use them with [`needs_shared`]: without the data, `cargo test` lists them as ignored; in CI
+//! Tests that use them are [`needs_shared`] instead of `test`: without the data, `cargo test` lists them as ignored; in CI
 //! they run and fail. Tests that take minutes and guard against rare faults are marked with [`nightly`].
 
 mod loop_disk;
@@ -42,6 +42,14 @@ pub fn shared(path: &str) -> PathBuf {
     let found = folder.join(path);
     assert!(found.exists(), "{} is missing from the test data", found.display());
     found
+}
+
+/// Asserts that the message of an error has all these parts: place, fault, advice.
+#[track_caller]
+pub fn assert_error<T>(result: Result<T, impl ToString>, parts: &[&str]) {
+    let message = result.err().map(|error| error.to_string());
+    let message = message.unwrap_or_else(|| panic!("no error, expected one with {parts:?}"));
+    assert!(parts.iter().all(|part| message.contains(part)), "{message}, expected {parts:?}");
 }
 
 /// Returns the shape and the elements of an array in an npz file.

@@ -316,7 +316,6 @@ mod tests {
 
     /// A decoder for two prompts runs twice, the second time padded, and gives the masks of one for any number.
     #[slag_test_support::needs_shared]
-    #[test]
     fn a_decoder_for_two_prompts_gives_the_same_masks() {
         let options = SessionOptions::new(slag_test_support::onnx_runtime());
         let dir = tempfile::tempdir().expect("a folder");

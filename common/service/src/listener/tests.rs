@@ -210,7 +210,7 @@ async fn long_heads_are_refused() {
     assert!(received.starts_with(b"HTTP/1.1 431"), "{}", String::from_utf8_lossy(&received));
 }
 
-/// A client that does not read delays the stop until the deadline, an idle one not at all.
+/// A client that does not read delays the stop until the deadline, an idle one not at all; what is read ends whole.
 #[tokio::test]
 async fn stopping_has_a_deadline() {
     let drain_timeout = Duration::from_millis(60);
@@ -219,13 +219,17 @@ async fn stopping_has_a_deadline() {
     let mut unread = connect(running.address, &REQUEST.replace("quick", "long")).await;
     unread.read_exact(&mut [0; 10]).await.expect("begins");
     running.stop.send(()).expect("runs");
-    let cut_off = running.ended.await.expect("ends").expect_err("cut off");
-    assert_eq!(cut_off.kind(), io::ErrorKind::TimedOut);
+    assert_eq!(running.ended.await.expect("ends").expect_err("cut off").kind(), io::ErrorKind::TimedOut);
 
     let running = start(ConnectionLimits::default()).await;
     let mut idle = connect(running.address, REQUEST).await;
     idle.read_exact(&mut [0; 12]).await.expect("answered");
+    let mut slow = connect(running.address, &REQUEST.replace("quick", "long")).await;
+    slow.read_exact(&mut [0; 10]).await.expect("begins");
     running.stop.send(()).expect("runs");
+    let mut rest = Vec::new();
+    slow.read_to_end(&mut rest).await.expect("ends whole");
+    assert!(rest.len() > LONG_BYTES && rest[rest.len() - LONG_BYTES..].iter().all(|byte| *byte == 7));
     running.ended.await.expect("ends").expect("in time");
     assert!(TcpStream::connect(running.address).await.is_err(), "no longer listening");
 }

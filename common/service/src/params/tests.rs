@@ -45,8 +45,7 @@ fn read(query: &str) -> Result<(What, Place), RequestError> {
 
 #[test]
 fn structs_share_a_query_string() {
-    let (what, place) =
-        read("text=a+b&radius=%2B1.5&even=4&text=c%2Cd&limit=7&box=&kind=place").expect("sound");
+    let (what, place) = read("text=a+b&radius=%2B1.5&even=4&text=c%2Cd&limit=7&box=&kind=place").unwrap();
     assert_eq!(what, What { text: vec!["a b".into(), "c,d".into()], kind: Kind::Place, even: Some(Even(4)) });
     assert_eq!(place, Place { radius: 1.5, bounds: Some(String::new()), limit: Some(7) });
     assert_eq!(read("radius=2").expect("sound").0, What::default());
@@ -71,8 +70,7 @@ fn refusals_name_parameter_value_and_what_was_expected() {
         ("radius=1&text=r%ffed", "text", "r\u{FFFD}ed", UTF8),
         ("radius=1&%ff=2", "\u{FFFD}", "2", UTF8),
     ] {
-        let refused = RequestError::new(parameter, found, expected);
-        assert_eq!(read(query), Err(refused), "{query}");
+        assert_eq!(read(query), Err(RequestError::new(parameter, found, expected)), "{query}");
     }
     let long = format!("radius=1&{}=2", "é".repeat(50));
     assert_eq!(read(&long).expect_err("unknown").parameter.chars().count(), MAX_NAME_CHARS);

@@ -132,8 +132,7 @@ fn files_without_a_pair_are_named() {
     let (_folder, files) = folder();
     let refused = |files: &TlsFiles| Tls::open(files.clone()).expect_err("no pair").to_string();
     assert!(refused(&files).contains("cert.pem: ") && refused(&files).contains("expected a certificate"));
-    let authority = Authority::new("one");
-    authority.issue("localhost", &files);
+    Authority::new("one").issue("localhost", &files);
     Tls::open(files.clone()).expect("a pair");
     let socket = Listen::Unix("s".into()).tls(Some(files.clone()));
     assert!(socket.expect_err("no TLS").to_string().contains("not for a Unix socket"));

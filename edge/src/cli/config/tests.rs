@@ -2,6 +2,7 @@ use clap::CommandFactory;
 
 use super::*;
 use crate::cli::Cli;
+use slag_test_support::assert_error;
 
 /// Parses a line with an environment and a file; returns a flag's values at the end of the chain of commands.
 fn parsed(line: &str, environment: &[(&str, &str)], file: &str) -> Result<ArgMatches, ConfigError> {
@@ -84,8 +85,7 @@ fn flags_of_a_file_need_and_exclude_others() {
         ("slag-edge list", &[], "[list]\nformat = 'csv'\njson = true", "cannot stand beside "),
         ("slag-edge status", &[], "quiet = true\nverbose = 1", "cannot stand beside "),
     ] {
-        let error = parsed(line, environment, file).expect_err(line).to_string();
-        assert!(error.contains(expected), "{line}: {error}");
+        assert_error(parsed(line, environment, file), &[expected]);
     }
     let here = [("SLAG_EDGE_FETCH_AT_GEO", "4,5")];
     for (line, environment, file, id, expected) in [
@@ -152,16 +152,13 @@ fn errors_name_the_file_and_the_key() {
         // Tables of other commands are checked, too.
         ("[trust.show]\njson = 7", "trust.show.json", "expected true or false"),
     ] {
-        let error = parsed("slag-edge status", &[], file).expect_err(file).to_string();
-        assert!(error.contains(&format!("edge.toml: {key}: ")) && error.contains(what), "{file}: {error}");
+        assert_error(parsed("slag-edge status", &[], file), &[&format!("edge.toml: {key}: "), what]);
     }
-    let error = parsed("slag-edge status", &[], "[fetch").expect_err("no TOML").to_string();
-    assert!(error.contains("edge.toml: ") && error.contains("line 1"), "{error}");
+    assert_error(parsed("slag-edge status", &[], "[fetch"), &["edge.toml: ", "line 1"]);
     let environment = [("SLAG_EDGE_SERVE_LISTEN", "nowhere")];
     let error = parsed("slag-edge serve", &environment, "").expect_err("no address").to_string();
     assert!(error.starts_with("SLAG_EDGE_SERVE_LISTEN: ") && error.contains("IP:PORT"), "{error}");
-    let error = parsed("slag-edge --config nowhere.toml status", &[], "").expect_err("no file").to_string();
-    assert!(error.contains("nowhere.toml`: No such file"), "{error}");
+    assert_error(parsed("slag-edge --config nowhere.toml status", &[], ""), &["nowhere.toml`: No such file"]);
     assert!(parsed("slag-edge status", &[("SLAG_EDGE_CONFIG", "")], "[no").is_ok(), "no file is read");
     let dir = tempfile::tempdir().expect("a folder");
     let pipe = dir.path().join("pipe");
@@ -171,8 +168,7 @@ fn errors_name_the_file_and_the_key() {
     let line = ["slag-edge", "--config", "", "status"].map(OsString::from);
     let named = |name: &str| (name == "SLAG_EDGE_CONFIG").then(|| "nowhere.toml".into());
     assert!(parse(Cli::command(), &line, &named).is_ok(), "no file is read");
-    let error =
-        parsed("slag-edge status", &[("SLAG_EDGE_SCENE", "x y")], "nothing = 1").expect_err("no flag");
+    let error = parsed("slag-edge status", &[("SLAG_EDGE_SCENE", "x y")], "nothing = 1").unwrap_err();
     assert!(error.to_string().len() < 120, "a hint, not all flags: {error}");
 }
 
@@ -218,8 +214,7 @@ fn the_sample_has_every_flag() {
 #[test]
 fn the_unit_has_room_for_all_queries() {
     let unit = include_str!("../../../../jetson/slag-edge.service");
-    let limit =
-        unit.lines().find_map(|line| line.strip_prefix("MemoryMax=")?.strip_suffix('G')).expect("a limit");
+    let limit = unit.lines().find_map(|line| line.strip_prefix("MemoryMax=")?.strip_suffix('G')).unwrap();
     let limit_bytes = limit.parse::<u64>().expect("gigabytes") << 30;
     let query_bytes = &values(&parsed("slag-edge serve", &[], "").expect("parses"), "max_query_bytes")[0];
     let query_bytes = query_bytes.parse::<slag_common::ByteSize>().expect("bytes").0;

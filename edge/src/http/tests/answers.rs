@@ -124,16 +124,14 @@ async fn several_texts_make_a_batch() {
 async fn formats_are_negotiated() {
     let service = Service::with_chair();
     let get = |uri: &str, accept: &str| {
-        let request =
-            Request::builder().uri(uri).header("accept", accept).body(Body::empty()).expect("a request");
+        let request = Request::builder().uri(uri).header("accept", accept).body(Body::empty()).unwrap();
         let router = router(Arc::clone(&service.app));
         async move {
             let response = router.oneshot(request).await.expect("infallible");
             response.headers()["content-type"].to_str().expect("text").to_owned()
         }
     };
-    let both = format!("text/html, {ARROW};q=0.9");
-    assert_eq!(get("/query?text=0&kind=gaussians", &both).await, ARROW);
+    assert_eq!(get("/query?text=0&kind=gaussians", &format!("text/html, {ARROW};q=0.9")).await, ARROW);
     assert_eq!(get("/query?text=0&kind=gaussians", "*/*").await, "application/json");
     assert_eq!(get("/query?text=0&kind=gaussians&format=json", ARROW).await, "application/json");
     assert_eq!(get("/query?text=0", ARROW).await, "application/problem+json");
@@ -153,8 +151,7 @@ async fn answers_that_nobody_reads_stop_nobody() {
     let uri = "/query?text=0&kind=gaussians&limit=60000&threshold=0.5";
     let response = service.send("GET", uri).await;
     assert_eq!(response.status(), StatusCode::OK);
-    let _permit = soon(service.app.permits.acquire()).await.expect("the answer is computed");
-    drop(_permit);
+    drop(soon(service.app.permits.acquire()).await.expect("the answer is computed"));
     assert_eq!(service.get("/query?text=0").await.0, StatusCode::OK);
     tokio::time::sleep(Duration::from_millis(1200)).await;
     assert!(soon(pieces(response)).await.is_err(), "the end must be an error");

@@ -434,8 +434,7 @@ async fn events_tell_of_generations_until_the_service_stops() {
     assert!(text.starts_with("event: generation\ndata: {") && text.contains("\"generation\":1"), "{text}");
     assert_eq!(service.get("/v1/events").await.0, StatusCode::SERVICE_UNAVAILABLE);
     write_cache(service.dir.path(), &room(), 2);
-    let second = next().await.expect("an event");
-    assert!(String::from_utf8_lossy(&second).contains("\"generation\":2"));
+    assert!(String::from_utf8_lossy(&next().await.expect("an event")).contains("\"generation\":2"));
     service.app.stopping.send_replace(true);
     assert!(next().await.is_none());
 }

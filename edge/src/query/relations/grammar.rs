@@ -265,6 +265,7 @@ mod tests {
     use serde_json::{Value, json};
 
     use super::*;
+    use slag_test_support::assert_error;
 
     fn read(text: &str) -> Value {
         serde_json::to_value(understand(text).expect(text)).expect("JSON")
@@ -342,12 +343,10 @@ mod tests {
             ("barrel in front", "left of me"),
             ("tent over there", "left of me"),
         ] {
-            let error = understand(text).expect_err(text).to_string();
-            assert!(error.contains(named), "{error}");
+            assert_error(understand(text), &[named]);
         }
         for text in ["101st nearest chair", "0th nearest chair"] {
-            let phrase = understand(text).expect(text).expect("a phrase");
-            assert!(phrase.check().is_err(), "{text}");
+            assert!(understand(text).expect(text).expect("a phrase").check().is_err(), "{text}");
         }
         for text in ["do not enter sign", "first aid box"] {
             assert_eq!(understand(text), Ok(None), "{text}");

@@ -19,6 +19,7 @@ use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, RasterView, Rasterizer, pinhole};
 use slag_encoder::store::StoreReader;
+use slag_test_support::assert_error;
 
 /// Gaussians across and down, 0.1 m apart, 2 m in front of the camera.
 const COLUMNS: usize = 24;
@@ -185,8 +186,7 @@ fn lerf_labels_are_judged_on_their_frames() {
     // Another splat than the one that was encoded.
     let mut other = wall.gaussians.clone();
     other.means_in_world.pop();
-    let message = judge(&labels, &other).expect_err("another splat").to_string();
-    assert!(message.contains("the store has 384 Gaussians, the splat 383"), "{message}");
+    assert_error(judge(&labels, &other), &["the store has 384 Gaussians, the splat 383"]);
 }
 
 #[test]
@@ -233,8 +233,7 @@ fn scans_are_judged_by_the_protocol() {
     let scan = Scan::read(&dir).expect("a scan");
     let wrong = wall.folder("scene0070_00");
     write_mesh(&wrong.join("scene0070_00_vh_clean_2.labels.ply"), &[([0.0; 3], 41)]);
-    let message = Scan::read(&wrong).expect_err("no such label").to_string();
-    assert!(message.contains("label 41, expected 0 to 40"), "{message}");
+    assert_error(Scan::read(&wrong), &["label 41, expected 0 to 40"]);
     let mut encoder = renamed(&[("wall", "red"), ("floor", "blue"), ("toilet", "green")]);
     let judge = |scan: &Scan, scene: &Gaussians, encoder: &mut Renamed| {
         scannet::judge(&wall.reader(), scan, scene, encoder, false)
@@ -255,8 +254,7 @@ fn scans_are_judged_by_the_protocol() {
 
     // Swapped words: no answer is correct.
     let mut swapped = renamed(&[("wall", "blue"), ("floor", "red")]);
-    let judged = judge(&scan, &wall.gaussians, &mut swapped);
-    assert_eq!(judged.expect("judges").subsets[0].miou, Some(0.0));
+    assert_eq!(judge(&scan, &wall.gaussians, &mut swapped).expect("judges").subsets[0].miou, Some(0.0));
     let none = judge(&scan, &wall.gaussians, &mut renamed(&[])).expect_err("no word");
     assert!(none.to_string().contains("none of the 19 words"), "{none}");
 

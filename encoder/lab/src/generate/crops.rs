@@ -266,8 +266,7 @@ mod tests {
         let n_segmented = made.iter().filter(|(_, label)| label.segmented).count();
         assert!(n_segmented > 20 && made.len() - n_segmented > 20, "{n_segmented} of {}", made.len());
         for (crop, label) in &made {
-            let n_inside = crop.inside().iter().filter(|inside| **inside).count();
-            assert_eq!(n_inside, label.area_px as usize);
+            assert_eq!(crop.inside().iter().filter(|inside| **inside).count(), label.area_px as usize);
             let outside = crop.image().pixels().zip(crop.inside()).filter(|(_, inside)| !**inside);
             assert!(outside.into_iter().all(|(pixel, _)| pixel.0 == [255; 3]));
             // A segment may include surroundings of the thing.

@@ -209,8 +209,7 @@ fn the_plain_average_changes_neither_table_nor_contributions() {
     let Scene { index, table, .. } = &open(&views(), DIM, &[N], u64::MAX);
     let plain = lifted(Aggregation::default(), u64::MAX);
     assert_eq!(plain.table, *table);
-    let contributions =
-        index.transpose(&index.read(0..1).expect("reads"), table).expect("transposes").remove(0);
+    let contributions = index.transpose(&index.read(0..1).unwrap(), table).unwrap().remove(0);
     let mut embeddings = vec![f32::NAN; N * DIM];
     let field = CellField::new((0..N as u32).collect(), contributions, table, &mut embeddings);
     assert_eq!((plain.field, plain.embeddings), (field, embeddings));

@@ -225,8 +225,7 @@ fn things_are_found_among_masks_of_parts_and_of_everything() {
     let found = world.objects_of(Some(&superpoints), u64::MAX, false).expect("not cancelled");
     assert_eq!(found.objects.len(), N_THINGS as usize);
     for (cell, of_cell) in world.split.cells.iter().zip(&found.object_of) {
-        let things = cell.gaussians.iter().map(|gaussian| gaussian / PER_ROW);
-        assert!(things.eq(of_cell.iter().copied()));
+        assert!(cell.gaussians.iter().map(|gaussian| gaussian / PER_ROW).eq(of_cell.iter().copied()));
     }
 }
 

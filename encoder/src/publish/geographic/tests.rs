@@ -96,8 +96,7 @@ fn coverage_is_valid_geojson() {
         let size = cell.bounds.size();
         let area_m2 = feature.property("area_m2").and_then(|v| v.as_f64()).expect("a number");
         assert!((area_m2 - size.x * size.y).abs() <= 1e-3 * size.x * size.y + 1e-6, "{area_m2}");
-        let polygon: Polygon =
-            feature.geometry.as_ref().expect("there").value.clone().try_into().expect("one polygon");
+        let polygon: Polygon = feature.geometry.as_ref().unwrap().value.clone().try_into().unwrap();
         assert_eq!(polygon.exterior().0.len(), 5, "closed, even around nothing");
     }
     let value: serde_json::Value = serde_json::from_str(&text).expect("JSON");

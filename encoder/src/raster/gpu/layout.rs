@@ -281,8 +281,7 @@ mod tests {
             assert_eq!(names.join(" "), expected);
             let real_bytes = if precision == Precision::F64 { 8 } else { 4 };
             assert!(columns.windows(2).all(|w| w[0].1 + w[0].2 == w[1].1), "no gaps: {columns:?}");
-            let width = columns.iter().find(|c| c.0 == "width_px").expect("width_px").1;
-            assert_eq!(width, 19 * real_bytes);
+            assert_eq!(columns.iter().find(|c| c.0 == "width_px").expect("width_px").1, 19 * real_bytes);
             let block = ViewBlock { reals: [0.0; 19], words: [0; 8] };
             assert_eq!(block.to_bytes(precision).len(), size_bytes);
         }

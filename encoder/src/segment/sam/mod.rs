@@ -200,8 +200,7 @@ mod tests {
 
     #[test]
     fn grids_and_crops_are_those_of_the_reference() {
-        let four = grid(2, 640, 480);
-        assert_eq!(four, [[160.0, 120.0], [480.0, 120.0], [160.0, 360.0], [480.0, 360.0]]);
+        assert_eq!(grid(2, 640, 480), [[160.0, 120.0], [480.0, 120.0], [160.0, 360.0], [480.0, 360.0]]);
         assert_eq!(grid(32, 1000, 700).len(), 1024);
         // By hand: the overlap is int(512 / 1500 * 480 * 2 / 2) = 163 px, then 81 px; a crop is
         // ceil((163 + 640) / 2) = 402 px wide and ceil((163 + 480) / 2) = 322 px high, then 221 and 181 px.

@@ -1,13 +1,14 @@
-//! Attributes that ignore a test where the machine lacks its requirements, or outside the nightly checks.
+//! Attributes of tests that are ignored where the machine lacks their requirements, or outside the nightly checks.
+//! They stand in the place of `#[test]`.
 //!
 //! Macros instead of a `cfg` from build scripts: a build script that watches a missing folder runs at every build,
 //! and recompiles each crate's library.
 
 use std::path::{Path, PathBuf};
 
-use proc_macro::TokenStream;
+use proc_macro::{TokenStream, TokenTree};
 
-/// Ignores a test where `../shared` is absent, except in CI. Stands above `#[test]`.
+/// A test that is ignored where `../shared` is absent, except in CI.
 ///
 /// Decided when the test is compiled; if the data has arrived since, `cargo test -- --ignored` runs the test.
 #[proc_macro_attribute]
@@ -18,7 +19,7 @@ pub fn needs_shared(_: TokenStream, test: TokenStream) -> TokenStream {
     marked(test, &["CI", "SLAG_SHARED"], is_ignored.then_some("needs the test data in ../shared"))
 }
 
-/// Leaves a test to `.ci/nightly`, which sets `SLAG_NIGHTLY`. Stands above `#[test]`; the argument says why.
+/// A test for `.ci/nightly`, which sets `SLAG_NIGHTLY`; the argument says why.
 #[proc_macro_attribute]
 pub fn nightly(why: TokenStream, test: TokenStream) -> TokenStream {
     let reason = format!("nightly: {}", why.to_string().trim_matches('"'));
@@ -27,21 +28,27 @@ pub fn nightly(why: TokenStream, test: TokenStream) -> TokenStream {
 
 /// `variables`: recompile the test when one changes.
 fn marked(test: TokenStream, variables: &[&str], reason: Option<&str>) -> TokenStream {
-    let code = test.to_string();
-    if !code.contains("#[test]") {
-        return parsed("compile_error!(\"this attribute stands above `#[test]`\");");
+    let mut tokens = test.clone().into_iter();
+    let mut attributes = Vec::new();
+    while matches!(tokens.next(), Some(TokenTree::Punct(hash)) if hash.as_char() == '#') {
+        attributes.extend(tokens.next().map(|attribute| attribute.to_string()));
     }
+    let has = |name: &str| attributes.iter().any(|attribute| attribute.contains(name));
     let looked_at = variables.iter().map(|name| format!("option_env!({name:?}),")).collect::<String>();
     let mut marked = parsed(&format!("const _: &[Option<&str>] = &[{looked_at}];"));
     // Another of these attributes may have marked it.
-    if let Some(reason) = reason.filter(|_| !code.contains("#[ignore")) {
+    if let Some(reason) = reason.filter(|_| !has("[ignore")) {
         marked.extend(parsed(&format!("#[ignore = {reason:?}]")));
+    }
+    // The last of several makes the test, when the marks of all are there.
+    if !["needs_shared]", "needs_loop_disk]", "nightly("].map(has).contains(&true) {
+        marked.extend(parsed("#[test]"));
     }
     marked.extend(test);
     marked
 }
 
-/// Ignores a test where no file system can be mounted through a loop device. Stands above `#[test]`.
+/// A test that is ignored where no file system can be mounted through a loop device.
 #[proc_macro_attribute]
 pub fn needs_loop_disk(_: TokenStream, test: TokenStream) -> TokenStream {
     let is_root =

@@ -1,10 +1,11 @@
-use glam::DVec2;
+use std::collections::BTreeMap;
+
+use glam::{DVec2, DVec3};
 use proptest::prelude::*;
 use slag_common::frames::Aabb;
 
 use super::*;
 use crate::query::relations::grammar::RELATIONS;
-use glam::DVec3;
 
 const METRES: f64 = 1.0;
 
@@ -28,77 +29,54 @@ fn any_solid() -> impl Strategy<Value = Solid> {
 
 #[test]
 fn a_room_by_hand() {
-    let table = solid([0.0, 0.0, 0.37], [1.6, 0.9, 0.74]);
-    let mug = solid([0.3, 0.1, 0.81], [0.1, 0.1, 0.14]);
-    let ball = solid([0.2, -0.1, 0.12], [0.24, 0.24, 0.24]);
-    let chair = solid([1.2, 0.0, 0.45], [0.5, 0.5, 0.9]);
-    let cushion = solid([1.2, 0.0, 0.5], [0.4, 0.4, 0.1]);
-    let wall = solid([0.0, 3.0, 1.3], [6.0, 0.05, 2.6]);
-    let clock = solid([0.5, 2.93, 1.8], [0.3, 0.06, 0.3]);
-    let rug = solid([0.0, 0.0, 0.01], [3.0, 2.0, 0.02]);
-    let cupboard = solid([-2.0, 2.5, 0.9], [1.0, 0.5, 1.8]);
-    let plate = solid([-2.0, 2.5, 1.0], [0.3, 0.3, 0.05]);
-    // Its visible part begins above its feet.
-    let wardrobe = solid([2.1, 0.0, 1.0], [1.0, 0.6, 1.88]);
-    let lamp = solid([0.0, 0.0, 2.2], [0.4, 0.4, 0.3]);
-    // Without their legs, which are thin: the chair's box begins 0.35 m above the floor, the desk's 0.4 m.
-    let floor = solid([0.0, 0.0, -0.05], [6.0, 6.0, 0.1]);
-    let seat = solid([-2.0, 0.0, 0.65], [0.5, 0.5, 0.6]);
-    let desk = solid([2.0, -2.0, 0.57], [1.2, 0.6, 0.34]);
-    let bed = solid([0.5, 1.8, 0.3], [1.6, 2.0, 0.5]);
+    let things = BTreeMap::from([
+        ("table", solid([0.0, 0.0, 0.37], [1.6, 0.9, 0.74])),
+        ("mug", solid([0.3, 0.1, 0.81], [0.1, 0.1, 0.14])),
+        ("ball", solid([0.2, -0.1, 0.12], [0.24, 0.24, 0.24])),
+        ("chair", solid([1.2, 0.0, 0.45], [0.5, 0.5, 0.9])),
+        ("cushion", solid([1.2, 0.0, 0.5], [0.4, 0.4, 0.1])),
+        ("wall", solid([0.0, 3.0, 1.3], [6.0, 0.05, 2.6])),
+        ("clock", solid([0.5, 2.93, 1.8], [0.3, 0.06, 0.3])),
+        ("rug", solid([0.0, 0.0, 0.01], [3.0, 2.0, 0.02])),
+        ("cupboard", solid([-2.0, 2.5, 0.9], [1.0, 0.5, 1.8])),
+        ("plate", solid([-2.0, 2.5, 1.0], [0.3, 0.3, 0.05])),
+        // Its visible part begins above its feet.
+        ("wardrobe", solid([2.1, 0.0, 1.0], [1.0, 0.6, 1.88])),
+        ("lamp", solid([0.0, 0.0, 2.2], [0.4, 0.4, 0.3])),
+        // Without their legs, which are thin: the chair's box begins 0.35 m above the floor, the desk's 0.4 m.
+        ("floor", solid([0.0, 0.0, -0.05], [6.0, 6.0, 0.1])),
+        ("seat", solid([-2.0, 0.0, 0.65], [0.5, 0.5, 0.6])),
+        ("desk", solid([2.0, -2.0, 0.57], [1.2, 0.6, 0.34])),
+        ("bed", solid([0.5, 1.8, 0.3], [1.6, 2.0, 0.5])),
+    ]);
     // From the south, looking north.
     let viewer = Viewer { position_in_world: DVec3::new(0.0, -4.0, 0.0), heading_rad: Some(1.57) };
-    let holds = |is, a: &Solid, b: &Solid| degree(is, a, b, Some(&viewer), METRES) >= HOLDS;
-    for (is, a, b) in [
-        (Relation::On, &mug, &table),
-        (Relation::On, &cushion, &chair),
-        (Relation::On, &clock, &wall),
-        (Relation::On, &table, &rug),
-        (Relation::On, &chair, &rug),
-        (Relation::Under, &ball, &table),
-        (Relation::Under, &table, &lamp),
-        (Relation::On, &seat, &floor),
-        (Relation::On, &desk, &floor),
-        (Relation::Above, &clock, &bed),
-        (Relation::Under, &bed, &clock),
-        (Relation::Above, &lamp, &table),
-        (Relation::In, &plate, &cupboard),
-        (Relation::Near, &mug, &table),
-        (Relation::Near, &chair, &table),
-        (Relation::Beside, &chair, &table),
-        (Relation::Beside, &wardrobe, &rug),
-        (Relation::RightOf, &chair, &table),
-        (Relation::Behind, &wall, &table),
-        (Relation::InFrontOf, &table, &wall),
+    let on = "mug table, cushion chair, clock wall, table rug, chair rug, seat floor, desk floor";
+    let not_on =
+        "table mug, ball table, lamp table, mug floor, cushion rug, lamp floor, chair table, cupboard wall";
+    let not_under = "chair wall, mug table, plate cupboard, chair table";
+    for (is, pairs, other_pairs) in [
+        (Relation::On, on, not_on),
+        (Relation::Under, "ball table, table lamp, bed clock", not_under),
+        (Relation::Above, "clock bed, lamp table", ""),
+        (Relation::In, "plate cupboard", "chair table, cupboard plate"),
+        (Relation::Near, "mug table, chair table", "plate mug"),
+        (Relation::Beside, "chair table, wardrobe rug", "mug table, clock table"),
+        (Relation::LeftOf, "", "chair table"),
+        (Relation::RightOf, "chair table", ""),
+        (Relation::Behind, "wall table", "chair table"),
+        (Relation::InFrontOf, "table wall", "wall table"),
     ] {
-        assert!(holds(is, a, b), "{is} {a:?} {b:?}: {}", degree(is, a, b, Some(&viewer), METRES));
+        for (pairs, holds) in [(pairs, true), (other_pairs, false)] {
+            for (a, b) in pairs.split(", ").filter_map(|pair| pair.split_once(' ')) {
+                let degree = degree(is, &things[a], &things[b], Some(&viewer), METRES);
+                assert_eq!(degree >= HOLDS, holds, "{a} {is} {b}: {degree}");
+            }
+        }
     }
-    for (is, a, b) in [
-        (Relation::On, &table, &mug),
-        (Relation::On, &ball, &table),
-        (Relation::On, &lamp, &table),
-        (Relation::On, &mug, &floor),
-        (Relation::On, &cushion, &rug),
-        (Relation::On, &lamp, &floor),
-        (Relation::Under, &chair, &wall),
-        (Relation::On, &chair, &table),
-        (Relation::On, &cupboard, &wall),
-        (Relation::Under, &mug, &table),
-        (Relation::Under, &plate, &cupboard),
-        (Relation::Under, &chair, &table),
-        (Relation::In, &chair, &table),
-        (Relation::In, &cupboard, &plate),
-        (Relation::Near, &plate, &mug),
-        (Relation::Beside, &mug, &table),
-        (Relation::Beside, &clock, &table),
-        (Relation::LeftOf, &chair, &table),
-        (Relation::Behind, &chair, &table),
-        (Relation::InFrontOf, &wall, &table),
-    ] {
-        assert!(!holds(is, a, b), "{is} {a:?} {b:?}: {}", degree(is, a, b, Some(&viewer), METRES));
-    }
-    assert!(between(&table, &solid([-2.0, 0.0, 0.5], [1.0; 3]), &solid([2.0, 0.3, 0.5], [1.0; 3])) > HOLDS);
-    assert!(between(&cupboard, &table, &chair) < HOLDS);
+    let [left, right] = [[-2.0, 0.0, 0.5], [2.0, 0.3, 0.5]].map(|centre| solid(centre, [1.0; 3]));
+    assert!(between(&things["table"], &left, &right) > HOLDS);
+    assert!(between(&things["cupboard"], &things["table"], &things["chair"]) < HOLDS);
 }
 
 /// Beside the asker itself, its heading decides.

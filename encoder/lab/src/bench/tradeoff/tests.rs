@@ -49,9 +49,7 @@ fn built_in_grids_have_flags_of_encode() {
         let grid = Grid::find(Path::new(name)).expect("a grid");
         assert!(grid.points.len() >= 4);
         for point in &grid.points {
-            let expand = |flags: &String| {
-                expand(flags, &scene, Some(&"s".into())).expect("known").expect("it has all")
-            };
+            let expand = |flags: &String| expand(flags, &scene, Some(&"s".into())).unwrap().unwrap();
             let line = "slag-encoder encode --scene a --views b --store c".split(' ').map(str::to_owned);
             let line: Vec<String> =
                 line.chain([&point.views, &point.lift].into_iter().flat_map(expand)).collect();
@@ -189,8 +187,7 @@ esac
     assert_eq!(called.lines().count(), 4, "{called}");
     assert!(called.lines().all(|line| line.contains("--models m")), "{called}");
     assert!(called.contains("--keep-views") && called.contains("--compact-error 0.3"), "{called}");
-    let again = measure(&scenes, &grid, &programs, &out, &Silent).expect("runs");
-    assert_eq!(again.figures, report.figures);
+    assert_eq!(measure(&scenes, &grid, &programs, &out, &Silent).expect("runs").figures, report.figures);
     assert_eq!(fs_err::read_to_string(&calls).expect("was called"), called, "nothing is measured twice");
     assert!(!out.join("store").exists());
 

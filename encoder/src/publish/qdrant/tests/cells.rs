@@ -78,8 +78,7 @@ async fn a_cell_is_repaired_alone() {
     // Cut off in the new collection: the old one's record must not count.
     let n_before = server.with(|state| state.acknowledged.len());
     fixture.push_cut_off(&server, &cells(&url), n_before + 2).await.expect_err("stopped");
-    let report = fixture.push(&cells(&url)).await.expect("fills it again");
-    assert_eq!(report.n_points, N_POINTS);
+    assert_eq!(fixture.push(&cells(&url)).await.expect("fills it again").n_points, N_POINTS);
     fixture.assert_cells_arrived(&server, 1);
     server.with(|state| state.collections.get_mut(NAMES[2]).expect("pushed").points.pop_first());
     let lost = fixture.push(&cells(&url)).await.expect_err("a point is missing");
@@ -134,8 +133,7 @@ async fn a_new_generation_replaces_cells_and_deletes_those_it_lacks() {
     assert_eq!((report.n_points, report.n_created_collections), (N_POINTS, 2));
     fixture.assert_cells_arrived(&server, 3);
     // The other layout leaves the cells alone.
-    let report = fixture.push(&options(&url)).await.expect("pushes");
-    assert_eq!(report.deleted_collections, [""; 0]);
+    assert_eq!(fixture.push(&options(&url)).await.expect("pushes").deleted_collections, [""; 0]);
     fixture.assert_cells_arrived(&server, 3);
     fixture.assert_arrived(&server, 3);
 }
@@ -171,12 +169,10 @@ fn snapshot(collection: &str, number: usize, n_points: u64) -> Snapshot {
 async fn each_collection_has_a_snapshot_of_its_generation() {
     let fixture = fixture();
     let (server, url) = Server::start(None).await;
-    let report = fixture.push(&cells(&url)).await.expect("pushes");
-    assert_eq!(report.snapshots, [], "none unless asked");
+    assert_eq!(fixture.push(&cells(&url)).await.expect("pushes").snapshots, [], "none unless asked");
     let options = PushOptions { snapshots: true, ..cells(&url) };
     server.with(|state| state.n_snapshots_allowed = Some(2));
-    let refused = fixture.push(&options).await.expect_err("the disk is full").to_string();
-    assert!(refused.contains("create a snapshot") && refused.contains("the disk is full"), "{refused}");
+    assert_error(fixture.push(&options).await, &["create a snapshot", "the disk is full"]);
     server.with(|state| state.n_snapshots_allowed = None);
     let report = fixture.push(&options).await.expect("goes on");
     let made = [snapshot(NAMES[0], 2, 50), snapshot(NAMES[1], 2, 0), snapshot(NAMES[2], 1, 45)];
@@ -191,6 +187,5 @@ async fn each_collection_has_a_snapshot_of_its_generation() {
     assert_eq!(json["snapshots"][2], expected);
     // Of a scene in one collection.
     let one = PushOptions { snapshots: true, ..super::options(&url) };
-    let report = fixture.push(&one).await.expect("pushes");
-    assert_eq!(report.snapshots, [snapshot("yard", 1, N_POINTS)]);
+    assert_eq!(fixture.push(&one).await.expect("pushes").snapshots, [snapshot("yard", 1, N_POINTS)]);
 }

@@ -44,8 +44,7 @@ fn masks_are_those_of_prompts_with_an_object() {
     let (_, objects) = array::<f32>(&golden, "object_score_logits");
     let (_, points) = array::<f32>(&golden, "points");
     let embedding = segmenter.lanes.take().embed(&photo).expect("it runs");
-    let decoded =
-        segmenter.lanes.take().decode(&embedding, 9, points.as_chunks::<2>().0, &[1; 9]).expect("it runs");
+    let decoded = segmenter.lanes.take().decode(&embedding, 9, points.as_chunks::<2>().0, &[1; 9]).unwrap();
     let size = [photo.width() as usize, photo.height() as usize];
     let mut expected: Vec<(u8, Vec<bool>)> = Vec::new();
     for (k, logits) in decoded.logits.chunks_exact(64 * 64).enumerate() {
