@@ -148,11 +148,8 @@ fn the_store_finds_what_the_robot_finds() {
     let store = site.cache().with_file_name("store");
     let mut query =
         encoder(&["query", "--store", text(&store), "--models", "colours", "red", "--limit", "100"]);
-    assert_eq!(
-        places(&json!({ "answers": run_json(&mut query)["things"] })),
-        of_store,
-        "the command line's, too"
-    );
+    let found = places(&json!({ "answers": run_json(&mut query)["things"] }));
+    assert_eq!(found, of_store, "the command line's, too");
 }
 
 /// Both programs suggest names of objects: the robot's list, then its other words.

@@ -89,10 +89,8 @@ fn robots_fetch_the_text_model_with_the_scene() {
     let served = at("served");
     let robot = Service::start(&mut edge(&["serve", "--cache", text(&served)]));
     let report = run_json(&mut fetch(&service.url, &served));
-    assert_eq!(
-        (&report["text_model"]["bytes"], &report["text_model"]["downloaded_bytes"]),
-        (&total.into(), &total.into())
-    );
+    let found = (&report["text_model"]["bytes"], &report["text_model"]["downloaded_bytes"]);
+    assert_eq!(found, (&total.into(), &total.into()));
     // It loads in the background.
     let is_ready = |_| {
         std::thread::sleep(Duration::from_millis(100));
@@ -103,19 +101,14 @@ fn robots_fetch_the_text_model_with_the_scene() {
     assert_eq!(answers["answers"], ask(&served), "{answers}");
     // A robot with the previous generation fetches shards only.
     let report = run_json(&mut fetch(&service.url, &with_models));
-    assert_eq!(
-        (&report["generation"], &report["text_model"]["downloaded_bytes"]),
-        (&3.into(), &0.into()),
-        "{report}"
-    );
+    let found = (&report["generation"], &report["text_model"]["downloaded_bytes"]);
+    assert_eq!(found, (&3.into(), &0.into()), "{report}");
     assert_eq!(ask(&with_models), ask(&served));
 
     // Unneeded objects are removed; the text model stays.
     run_json(&mut encoder(&["store", "gc", "--store", text(&store)]));
-    assert_eq!(
-        run_json(&mut encoder(&["store", "verify", "--store", text(&store)]))["bad"],
-        serde_json::json!([])
-    );
+    let found = run_json(&mut encoder(&["store", "verify", "--store", text(&store)]));
+    assert_eq!(found["bad"], serde_json::json!([]));
 
     // Over static files.
     run_json(&mut encoder(&["store", "export", "--store", text(&store), "--out", text(&site)]));

@@ -141,10 +141,8 @@ mod tests {
     #[test]
     fn what_stands_in_a_files_place_is_named() {
         let named = |start: &[u8]| stand_in(start).map(|found| found.what);
-        assert_eq!(
-            named(b"version https://git-lfs.github.com/spec/v1\n"),
-            Some("this is a pointer of Git LFS")
-        );
+        let pointer = named(b"version https://git-lfs.github.com/spec/v1\n");
+        assert_eq!(pointer, Some("this is a pointer of Git LFS"));
         assert_eq!(named(b"\n<html><body>Please log in"), Some("this is a web page"));
         assert_eq!(named(b"<!DOCTYPE html>"), Some("this is a web page"));
         for other in [&b"ply\nformat"[..], b"version 2", b"<svg", b"<", b""] {
@@ -153,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn texts_of_windows_are_read_and_strangers_are_named() {
+    fn texts_of_windows_are_read_and_other_files_are_named() {
         let of = |bytes: &[u8]| text_of(bytes).map(str::to_owned).map_err(|found| found.to_string());
         assert_eq!(of("\u{feff}[ä]".as_bytes()), Ok("[ä]".into()));
         for text in ["", "{", &"\0".repeat(9)] {

@@ -108,6 +108,8 @@ fn a_given_image_folder_replaces_the_default() {
 /// Every lens model, as text and binary; the test builds the binary files itself.
 #[test]
 fn lens_models() {
+    const EIGHT: [f64; 8] = [50.0, 51.0, 32.0, 24.0, 0.1, -0.2, 0.3, 0.4];
+    let fisheye = Distortion::Fisheye { k: [0.1, -0.2, 0.3, 0.4] };
     let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
     type Case = (i32, &'static str, &'static [f64], [f64; 4], Distortion);
     let cases: [Case; 7] = [
@@ -116,20 +118,8 @@ fn lens_models() {
         (2, "SIMPLE_RADIAL", &[50.0, 32.0, 24.0, 0.1], [50.0, 50.0, 32.0, 24.0], brown(0.1, 0.0, [0.0; 2])),
         (2, "SIMPLE_RADIAL", &[50.0, 32.0, 24.0, 0.0], [50.0, 50.0, 32.0, 24.0], Distortion::None),
         (3, "RADIAL", &[50.0, 32.0, 24.0, 0.1, -0.2], [50.0, 50.0, 32.0, 24.0], brown(0.1, -0.2, [0.0; 2])),
-        (
-            4,
-            "OPENCV",
-            &[50.0, 51.0, 32.0, 24.0, 0.1, -0.2, 0.3, 0.4],
-            [50.0, 51.0, 32.0, 24.0],
-            brown(0.1, -0.2, [0.3, 0.4]),
-        ),
-        (
-            5,
-            "OPENCV_FISHEYE",
-            &[50.0, 51.0, 32.0, 24.0, 0.1, -0.2, 0.3, 0.4],
-            [50.0, 51.0, 32.0, 24.0],
-            Distortion::Fisheye { k: [0.1, -0.2, 0.3, 0.4] },
-        ),
+        (4, "OPENCV", &EIGHT, [50.0, 51.0, 32.0, 24.0], brown(0.1, -0.2, [0.3, 0.4])),
+        (5, "OPENCV_FISHEYE", &EIGHT, [50.0, 51.0, 32.0, 24.0], fisheye),
     ];
     for (number, model, params, [fx, fy, cx, cy], distortion) in cases {
         let words: Vec<String> = params.iter().map(f64::to_string).collect();
@@ -149,15 +139,10 @@ fn lens_models() {
             assert!(view.image_path.ends_with("images/with space/a b.jpg"));
             assert_eq!(view.position_in_world(), DVec3::new(-1.0, -2.0, -3.0));
             let camera = view.intrinsics;
-            assert_eq!(
-                (camera.width_px, camera.height_px, camera.distortion),
-                (64, 48, distortion),
-                "{model}"
-            );
-            assert_eq!(
-                [camera.focal_x_px, camera.focal_y_px, camera.centre_x_px, camera.centre_y_px],
-                [fx, fy, cx, cy]
-            );
+            let size_px = [camera.width_px, camera.height_px];
+            assert_eq!((size_px, camera.distortion), ([64, 48], distortion), "{model}");
+            assert_eq!([camera.focal_x_px, camera.focal_y_px], [fx, fy]);
+            assert_eq!([camera.centre_x_px, camera.centre_y_px], [cx, cy]);
         }
     }
 }
@@ -196,7 +181,10 @@ fn colmap_errors_have_place_and_fault() {
         let read = read_text(CAMERA, &format!("1 1 0 0 0 0 0 0 1 {name}\n\n"));
         assert_error(read, &["is not a relative path inside the image folder"]);
     }
-    assert_error(read_files(&[("cameras.txt", b"")]), &["no poses found", "give the folder of a COLMAP model"]);
+    assert_error(
+        read_files(&[("cameras.txt", b"")]),
+        &["no poses found", "give the folder of a COLMAP model"],
+    );
     assert_error(
         read_files(&[("transforms_train.json", b"{}")]),
         &["no poses found", "give /", "/transforms_train.json"],
@@ -488,10 +476,8 @@ fn transforms_with_an_angle_and_bare_names() {
     assert_eq!(view.name, "train/r_0.01.png");
     assert!(view.image_path.is_file());
     let camera = view.intrinsics;
-    assert_eq!(
-        (camera.width_px, camera.height_px, camera.centre_x_px, camera.centre_y_px),
-        (40, 30, 20.0, 15.0)
-    );
+    assert_eq!([camera.width_px, camera.height_px], [40, 30]);
+    assert_eq!([camera.centre_x_px, camera.centre_y_px], [20.0, 15.0]);
     assert!((camera.focal_x_px - 20.0).abs() < 1e-12 && (camera.focal_y_px - 20.0).abs() < 1e-12);
     assert_eq!(camera.distortion, Distortion::None);
 }
@@ -528,7 +514,7 @@ fn transforms_errors_have_place_and_fault() {
     assert_error(with("frames", twice), &["two images have the name \"a.jpg\""]);
     assert_error(
         read_files(&[("transforms.json", b"{\"frames\": 3}")]),
-        &["export the file again with nerfst"],
+        &["export the file again with nerfstudio"],
     );
 }
 

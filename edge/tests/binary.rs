@@ -385,10 +385,8 @@ fn the_memory_attack_stays_within_the_budget() {
     println!("{n_answered} of 96 answered; memory grew from {before} by {grown} bytes");
     for (status, answer) in &answers {
         let refusal = answer["detail"].as_str().unwrap_or_default();
-        assert!(
-            *status == 200 || *status == 503 && refusal.contains(&(4 * QUERY_BYTES).to_string()),
-            "{answer}"
-        );
+        let holds = *status == 200 || *status == 503 && refusal.contains(&(4 * QUERY_BYTES).to_string());
+        assert!(holds, "{answer}");
     }
     assert!(n_answered > 0);
     // Four queries' worth, and twice as much again for uncounted memory: text models, stacks, the allocator's.

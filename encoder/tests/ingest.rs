@@ -9,22 +9,12 @@ use slag_encoder::ingest::{
 };
 
 fn camera(distortion: Distortion) -> Intrinsics {
-    Intrinsics {
-        focal_y_px: 105.0,
-        centre_x_px: 82.0,
-        centre_y_px: 57.0,
-        distortion,
-        ..pinhole([160, 120], 100.0)
-    }
+    let camera = pinhole([160, 120], 100.0);
+    Intrinsics { focal_y_px: 105.0, centre_x_px: 82.0, centre_y_px: 57.0, distortion, ..camera }
 }
 
-fn view(image_path: &Path, intrinsics: Intrinsics) -> View {
-    View {
-        name: "a.png".to_owned(),
-        image_path: image_path.to_owned(),
-        intrinsics,
-        camera_from_world: DAffine3::IDENTITY,
-    }
+fn view(path: &Path, intrinsics: Intrinsics) -> View {
+    View { name: "a.png".into(), image_path: path.into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 
 /// A smooth pattern of the undistorted image; argument in pixels.
@@ -297,10 +287,8 @@ fn geo_reference() {
     assert!(matches!(read_geo_reference("/dev/zero".as_ref()), Err(GeoError::File { .. })));
     let brighton = shared("scenes/brighton/geo.json");
     let origin = read_geo_reference(&brighton).unwrap().origin;
-    assert_eq!(
-        (origin.latitude_deg, origin.longitude_deg, origin.height_m),
-        (46.842657, -91.994008, 158.509)
-    );
+    let found = (origin.latitude_deg, origin.longitude_deg, origin.height_m);
+    assert_eq!(found, (46.842657, -91.994008, 158.509));
 }
 
 /// Oracle: numeric derivatives. Strong tangential terms fold the image, and folded pixels have no image; lenses of

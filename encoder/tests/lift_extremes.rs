@@ -218,14 +218,9 @@ fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (
     let bank = TextBank::directions(embeddings.dim);
     let metric = ScoreMetric::new(embeddings.dim, &bank);
     let spread = metric.spread(Rows::all(&embeddings.vectors, embeddings.dim));
-    let settings = ShardSettings { profiles: vec![Profile::Exact], ..ShardSettings::default() };
-    let score_context = ScoreMetricContext { metric, bank, spread };
-    let builder = ShardBuilder {
-        scene,
-        encoder_id: Hash32([0; 32]),
-        score_context: &score_context,
-        settings: &settings,
-    };
+    let settings = &ShardSettings { profiles: vec![Profile::Exact], ..ShardSettings::default() };
+    let score_context = &ScoreMetricContext { metric, bank, spread };
+    let builder = ShardBuilder { scene, encoder_id: Hash32([0; 32]), score_context, settings };
     let built = builder.build(0, cell, embeddings, None, Additions::default());
     (AlignedBytes::copy_of(&built.shards[0].bytes), built.position_error)
 }

@@ -38,10 +38,8 @@ fn draw(floor: u64, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Re
         let depth = -world_from_camera.translation.z / ray.z;
         (depth, world_from_camera.translation + depth * ray)
     };
-    let mut drawn = Rendering {
-        grey: Grey { width, height, values: Vec::new() },
-        depth: Vec::with_capacity(width * height),
-    };
+    let grey = Grey { width, height, values: Vec::new() };
+    let mut drawn = Rendering { grey, depth: Vec::with_capacity(width * height) };
     for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y as f64, x as f64))) {
         let rays =
             (0..9).map(|i| hit(x + f64::from(i % 3 * 2 + 1) / 6.0, y + f64::from(i / 3 * 2 + 1) / 6.0));
@@ -178,15 +176,8 @@ fn hostile_photos_are_lost() {
         Grey { width, height, values: values.collect() }
     };
     let plain = |value: f32| Grey { width: 640, height: 480, values: vec![value; 640 * 480] };
-    for grey in [
-        noise(640, 480),
-        noise(1, 1),
-        noise(5000, 3),
-        noise(15, 2000),
-        plain(0.0),
-        plain(f32::NAN),
-        plain(1e30),
-    ] {
+    let noises = [(640, 480), (1, 1), (5000, 3), (15, 2000)].map(|(width, height)| noise(width, height));
+    for grey in noises.into_iter().chain([0.0, f32::NAN, 1e30].map(plain)) {
         let intrinsics =
             Intrinsics { width_px: grey.width as u32, height_px: grey.height as u32, ..INTRINSICS };
         let photo =

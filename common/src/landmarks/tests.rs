@@ -39,10 +39,8 @@ fn landmarks_come_back_by_hand() {
     let view = checked(&bytes).expect("sound").expect("there");
     assert_eq!((view.header.code_version, view.len()), (7, 3));
     let found: Vec<_> = view.iter().collect();
-    assert_eq!(
-        found.iter().map(|l| (l.code, l.view)).collect::<Vec<_>>(),
-        [(code, 3), (1, u16::MAX), (1 << 127, 0)]
-    );
+    let seen = found.iter().map(|l| (l.code, l.view)).collect::<Vec<_>>();
+    assert_eq!(seen, [(code, 3), (1, u16::MAX), (1 << 127, 0)]);
     for (found, x) in found.iter().zip([-1.0, 0.0, 2.0]) {
         let expected = DVec3::new(x, -2.0, 1e6);
         assert!(found.position_in_world.distance(expected) <= 3.0 / 65_535.0 / 2.0 + 1e-9, "{found:?}");

@@ -17,10 +17,8 @@ fn composition_and_inverse_are_those_of_matrices() {
     };
     let (a, b) = (example(), other);
     let close = |x: DAffine3, y: DAffine3| {
-        assert!(
-            x.to_cols_array().iter().zip(y.to_cols_array()).all(|(x, y)| (x - y).abs() < 1e-12),
-            "{x} {y}"
-        );
+        let holds = x.to_cols_array().iter().zip(y.to_cols_array()).all(|(x, y)| (x - y).abs() < 1e-12);
+        assert!(holds, "{x} {y}");
     };
     close(matrix(&a.after(&b)), matrix(&a) * matrix(&b));
     close(matrix(&a.inverse()), matrix(&a).inverse());

@@ -86,11 +86,16 @@ fn encodings_types_and_orders_give_the_same_gaussians() {
     assert_eq!(found.sh_rest, expected.sh_rest);
 }
 
+/// Lines of a header.
+fn floats(names: &str) -> String {
+    names.split(' ').map(|name| format!("property float {name}\n")).collect()
+}
+
 #[test]
 fn plain_colours_stand_in_for_harmonics() {
     let header = "ply\nformat ascii 1.0\nelement vertex 1\n";
     let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2";
-    let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
+    let floats = floats(names);
     let colours = |kind: &str| {
         ["red", "green", "blue"].map(|c| format!("property {kind} {c}\n")).concat() + "end_header\n"
     };
@@ -110,7 +115,7 @@ fn plain_colours_stand_in_for_harmonics() {
 #[test]
 fn opacities_in_bytes_are_shares() {
     let names = "x y z rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
-    let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
+    let floats = floats(names);
     let header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty uchar opacity\n";
     let rows = ["0", "51"].map(|opacity| format!("{opacity} 1 2 3 2 0 0 0 0 0 0 0 0 0\n")).concat();
     let found = read_well("bytes.ply", format!("{header}{floats}end_header\n{rows}").as_bytes());
@@ -135,7 +140,7 @@ fn the_splat_in_a_folder_is_named() {
 fn rows_that_cannot_be_drawn_keep_their_place() {
     let header = "ply\nformat ascii 1.0\nelement vertex 4\n";
     let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
-    let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
+    let floats = floats(names);
     let rows = "-nan(ind) 0 0 0 1 0 0 0 0 0 0 0 0 0\n0 0 0 0 0 0 0 0 0 0 0 0 0 0\n\
                 0 0 0 inf 1 0 0 0 -inf 0 0 0 0 0\n0 0 0 0 1 0 0 0 inf 0 0 0 0 0\n";
     let text = format!("{header}{floats}end_header\n{rows}");

@@ -111,10 +111,8 @@ mod tests {
                 }
                 for (cell, expected) in expected.iter().enumerate() {
                     let found = found.to(cell).unwrap_or(f64::INFINITY);
-                    assert!(
-                        found == *expected || (found - expected).abs() < 1e-9,
-                        "{cell}: {found} {expected}"
-                    );
+                    let holds = found == *expected || (found - expected).abs() < 1e-9;
+                    assert!(holds, "{cell}: {found} {expected}");
                 }
             }
         }

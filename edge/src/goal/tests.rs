@@ -74,23 +74,20 @@ fn asked(change: impl FnOnce(&mut GoalRequest)) -> GoalRequest {
     request
 }
 
-fn stand(
-    world: &BuiltOccupancy,
-    request: &GoalRequest,
-    near: DVec3,
-    points: &[DVec3],
-) -> Result<Vec<Goal>, NoGoal> {
+type Goals = Result<Vec<Goal>, NoGoal>;
+
+fn stand(world: &BuiltOccupancy, request: &GoalRequest, near: DVec3, points: &[DVec3]) -> Goals {
     let (request, budget) = (&GoalRequest { near: Some(near), ..request.clone() }, Budget::default());
     let seen = Surroundings::of(&[world.view()], request, near, &budget).expect("places are known");
     let start = seen.start(near, request.robot.radius_m).ok_or(NoGoal::UnknownGround)?;
     choose(&seen, &seen.paths_from(start), request, points)
 }
 
-fn goals_with(world: &BuiltOccupancy, request: &GoalRequest) -> Result<Vec<Goal>, NoGoal> {
+fn goals_with(world: &BuiltOccupancy, request: &GoalRequest) -> Goals {
     stand(world, request, START, &points())
 }
 
-fn goals(more: impl Fn(DVec3) -> Option<At>) -> Result<Vec<Goal>, NoGoal> {
+fn goals(more: impl Fn(DVec3) -> Option<At>) -> Goals {
     goals_with(&packed(hall(more)), &asked(|r| r.stand.limit = 5))
 }
 

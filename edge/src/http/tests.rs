@@ -82,6 +82,13 @@ impl Service {
         soon(async { read(self.send("GET", uri).await).await }).await
     }
 
+    /// Returns the body of an answer with status 200.
+    async fn ok(&self, uri: &str) -> Value {
+        let (status, _, body) = self.get(uri).await;
+        assert_eq!(status, StatusCode::OK, "{uri}: {body:#}");
+        body
+    }
+
     async fn post(&self, uri: &str, kind: &str, body: impl Into<Body>) -> Answered {
         post(&self.app, uri, kind, body).await
     }
@@ -192,10 +199,8 @@ async fn refusals_are_problem_details() {
         assert_eq!(body["parameter"], parameter, "{shown}: {body}");
         assert_eq!(body["status"], status, "{shown}: {body}");
         for member in ["type", "title", "detail", "found", "expected"] {
-            assert!(
-                body[member].as_str().is_some_and(|text| !text.is_empty() && text.len() < 300),
-                "{shown}: {body}"
-            );
+            let holds = body[member].as_str().is_some_and(|text| !text.is_empty() && text.len() < 300);
+            assert!(holds, "{shown}: {body}");
         }
     }
     let (_, _, unknown) = service.get("/query?text=sofa").await;

@@ -352,11 +352,8 @@ mod tests {
             let at = (random.bits() % 3000) as f32;
             for threshold in [own, own.next_up(), own.next_down(), own + step * at, f32::NEG_INFINITY, 9e9] {
                 let expected = (0..=most).find(|sum| own + step * f32::from(*sum) >= threshold);
-                assert_eq!(
-                    least_sum(own, step, most, threshold),
-                    expected,
-                    "{own} {step} {most} {threshold}"
-                );
+                let found = least_sum(own, step, most, threshold);
+                assert_eq!(found, expected, "{own} {step} {most} {threshold}");
             }
         }
     }

@@ -30,14 +30,8 @@ fn exact_shards() -> impl Strategy<Value = Vec<TestShard>> {
                 let origin = DVec3::from(origin.map(|v| f64::from(v) * 8.0));
                 let step = DVec3::new(1.0, 0.5, 0.25) / STEPS_PER_UNIT;
                 let cell_id = at as u32 + 10;
-                TestShard {
-                    cell_id,
-                    origin,
-                    step,
-                    without_evidence,
-                    has_exact_centroids: true,
-                    ..TestShard::new(centroids)
-                }
+                let shard = TestShard { has_exact_centroids: true, ..TestShard::new(centroids) };
+                TestShard { cell_id, origin, step, without_evidence, ..shard }
             };
         shards.into_iter().enumerate().map(build).filter(|s| !s.centroids.is_empty()).collect()
     })
@@ -62,11 +56,8 @@ fn region() -> impl Strategy<Value = Region> {
     let ball = (point(), 0u32..40)
         .prop_map(|(centre_in_world, radius)| Ball { centre_in_world, radius: f64::from(radius) + 0.1 });
     let bounds = (point(), point()).prop_map(|(a, b)| Aabb { min: a.min(b), max: a.max(b) });
-    (prop::option::of(ball), prop::option::of(bounds)).prop_map(|(ball, bounds)| Region {
-        ball,
-        bounds,
-        polygon: None,
-    })
+    let either = (prop::option::of(ball), prop::option::of(bounds));
+    either.prop_map(|(ball, bounds)| Region { ball, bounds, polygon: None })
 }
 
 /// `q · e - max_j n_j · e` in f64.
@@ -211,10 +202,8 @@ fn answers_keep_within_the_stated_bound() {
                         assert!(error <= bound, "{score} {truth} {bound}");
                         largest_share = largest_share.max(error / bound);
                     } else {
-                        assert!(
-                            truth < f64::from(threshold) + bound,
-                            "missed {truth} at {threshold}, bound {bound}"
-                        );
+                        let holds = truth < f64::from(threshold) + bound;
+                        assert!(holds, "missed {truth} at {threshold}, bound {bound}");
                     }
                     n_between += usize::from((truth - f64::from(threshold)).abs() < bound);
                     let is_exactly_in = exact_in.binary_search(&name).is_ok();

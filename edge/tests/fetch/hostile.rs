@@ -94,10 +94,8 @@ fn lasting_faults_are_given_up_and_told() {
         assert_eq!(error.to_string().contains("are kept"), fault == Fault::Cut(100), "{fault:?}: {error}");
         match error {
             FetchError::Download { attempts, failure, .. } => {
-                assert!(
-                    attempts == expected_attempts && is_expected(&failure),
-                    "{fault:?}: {attempts} {failure}"
-                );
+                let holds = attempts == expected_attempts && is_expected(&failure);
+                assert!(holds, "{fault:?}: {attempts} {failure}");
             }
             other => panic!("{fault:?}: {other}"),
         }

@@ -2,12 +2,8 @@
 
 use super::*;
 
-fn at_cells(
-    scene: &Published,
-    cells: &[usize],
-    fault: &Fault,
-) -> impl FnMut(&Seen) -> Fault + Send + 'static {
-    let shards = cells.iter().map(|cell| scene.manifest.cells[*cell].shards[&Profile::Compact].hash);
+fn at_cells(scene: &Published, ids: &[usize], fault: &Fault) -> impl FnMut(&Seen) -> Fault + Send + 'static {
+    let shards = ids.iter().map(|cell| scene.manifest.cells[*cell].shards[&Profile::Compact].hash);
     let bad: Vec<String> = shards.map(|hash| format!("/v1/objects/{hash}")).collect();
     let fault = fault.clone();
     move |seen| if bad.contains(&seen.path) { fault.clone() } else { Fault::None }

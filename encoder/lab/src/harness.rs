@@ -109,10 +109,8 @@ mod tests {
     #[test]
     fn fields_are_found_and_warm_up_does_not_count() {
         let text = "VmPeak:\t 12 kB\nVmRSS:\t  345 kB\nmodel name\t: A: B\n";
-        assert_eq!(
-            (field(text, "VmRSS"), field(text, "model name")),
-            (Some("345 kB".into()), Some("A: B".into()))
-        );
+        let found = (field(text, "VmRSS"), field(text, "model name"));
+        assert_eq!(found, (Some("345 kB".into()), Some("A: B".into())));
         assert_eq!(field(text, "Vm"), None);
         let mut turns = Vec::new();
         let work = |turn| {

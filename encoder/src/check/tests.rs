@@ -143,11 +143,7 @@ fn nerfstudios_defaults_are_its_formulas() {
         let mean = poses.iter().map(|p| p.1).sum::<DVec3>() / poses.len() as f64;
         let up = poses.iter().map(|p| p.0.y_axis).sum::<DVec3>().normalize();
         let v = up.cross(DVec3::Z);
-        let k = DMat3::from_cols(
-            DVec3::new(0.0, v.z, -v.y),
-            DVec3::new(-v.z, 0.0, v.x),
-            DVec3::new(v.y, -v.x, 0.0),
-        );
+        let k = DMat3::from_cols_array(&[0.0, v.z, -v.y, -v.z, 0.0, v.x, v.y, -v.x, 0.0]);
         let rotation = match orients {
             true => DMat3::IDENTITY + k + k * k * ((1.0 - up.z) / v.length_squared()),
             false => DMat3::IDENTITY,
@@ -174,12 +170,8 @@ fn most_views_must_fit() {
         is_far_below: false,
     };
     let fit = |good: usize, bad: usize, capped: usize| {
-        let all = [
-            vec![checked(45.0, 12.0); good],
-            vec![checked(11.0, 12.0); bad],
-            vec![checked(5.0, 99.0); capped],
-        ];
-        let means = means_of(&all.concat());
+        let of = |psnr_db, flat_psnr_db, n| vec![checked(psnr_db, flat_psnr_db); n];
+        let means = means_of(&[of(45.0, 12.0, good), of(11.0, 12.0, bad), of(5.0, 99.0, capped)].concat());
         (means.average_fits(), means.fit())
     };
     assert_eq!(fit(2, 3, 0), (true, false));
@@ -268,10 +260,8 @@ fn intrinsics_of_no_camera_are_suspected() {
     let camera = slag_common::Intrinsics { centre_x_px: 0.5, centre_y_px: 0.5, ..pinhole([640, 480], 0.87) };
     let small = RasterView { intrinsics: camera.scaled_to(320, 240), camera_from_world: DAffine3::IDENTITY };
     let corrected = shares([640.0; 2]).expect("a mistake").corrected(&small).intrinsics;
-    assert!(
-        (corrected.focal_y_px - 0.87 * 320.0).abs() < 1e-9 && corrected.centre_y_px == 120.0,
-        "{corrected:?}"
-    );
+    let holds = (corrected.focal_y_px - 0.87 * 320.0).abs() < 1e-9 && corrected.centre_y_px == 120.0;
+    assert!(holds, "{corrected:?}");
 }
 
 /// Photos whose poses were never found all have the same one; a tripod's pair does not count.

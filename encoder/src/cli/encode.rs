@@ -487,10 +487,8 @@ mod tests {
         let choices = parse_choices("--preset fast --views-limit 25% --superpoint 3").expect("understood");
         let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
         choices.apply(&mut settings);
-        assert_eq!(
-            (settings.run.views_limit, settings.aggregation.superpoint),
-            (ViewsLimit::Share(0.25), 3.0)
-        );
+        let found = (settings.run.views_limit, settings.aggregation.superpoint);
+        assert_eq!(found, (ViewsLimit::Share(0.25), 3.0));
         for wrong in ["--scene x", "--segmenter x", "--threads 1", "--preset nothing", "--models=x"] {
             let message = format!("{:#}", parse_choices(wrong).expect_err("refused"));
             assert!(message.contains(wrong), "{message}");

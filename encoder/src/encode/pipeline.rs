@@ -239,10 +239,8 @@ mod tests {
         assert!((4..=15).contains(&most), "{most}");
         assert_eq!(reports.len(), 5);
         for report in &reports {
-            assert!(
-                report.busy_secs > 0.0 && report.busy_share > 0.0 && report.busy_share <= 1.0,
-                "{report:?}"
-            );
+            let holds = report.busy_secs > 0.0 && report.busy_share > 0.0 && report.busy_share <= 1.0;
+            assert!(holds, "{report:?}");
         }
     }
 

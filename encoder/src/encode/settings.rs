@@ -457,10 +457,8 @@ mod tests {
         let paper = settings(Preset::Paper);
         let view = &paper.view;
         assert_eq!((view.regions, paper.aggregation), (Regions::Crops, Aggregation::default()));
-        assert_eq!(
-            (paper.cells.objects, view.min_mask_px, view.merges_slivers, view.raster_width),
-            (false, 1, false, RasterWidth::Px(648))
-        );
+        let found = (paper.cells.objects, view.min_mask_px, view.merges_slivers, view.raster_width);
+        assert_eq!(found, (false, 1, false, RasterWidth::Px(648)));
         let sam = Preset::Paper.sam();
         assert_eq!((sam.points_per_side, sam.levels), (16, SamLevels::Whole));
         assert_eq!((sam.predicted_iou, sam.stability, sam.stability_offset), (0.7, 0.85, 1.0));

@@ -108,15 +108,8 @@ impl World {
     ) -> Result<SceneObjects, ContributionError> {
         let Self { gaussians, split, index, photos, .. } = self;
         let cancel = &AtomicBool::new(is_cancelled);
-        let scene = SceneContributions {
-            index,
-            gaussians,
-            split,
-            standing: &Standing::default(),
-            photos,
-            group_bytes,
-            cancel,
-        };
+        let standing = &Standing::default();
+        let scene = SceneContributions { index, gaussians, split, standing, photos, group_bytes, cancel };
         find(&scene, &self.table, superpoints, &self.score_context)
     }
 }

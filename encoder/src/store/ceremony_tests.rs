@@ -19,13 +19,8 @@ fn robots_follow_every_change_of_keys() {
     publish(dir.path(), 1).expect("publishes");
     let (mut kept, mut sleeper) = (client(dir.path()), client(dir.path()));
     let root_keys = default_root_folder(dir.path());
-    let changes = [
-        &["timestamp"][..],
-        &["snapshot"],
-        &["targets"],
-        &["root"],
-        &["root", "targets", "snapshot", "timestamp"],
-    ];
+    let all = ["root", "targets", "snapshot", "timestamp"];
+    let changes = [&all[3..], &all[2..3], &all[1..2], &all[..1], &all];
     for (version, names) in (2u64..).zip(changes) {
         follow(&mut kept, dir.path(), clock_unix_secs()).expect("before");
         let metadata = Metadata::open(dir.path()).expect("opens");

@@ -118,10 +118,8 @@ fn an_expired_root_is_warned_of_and_renewed() {
     assert!(is_refused(&mut kept));
     let warned = || MetadataReader::new(dir.path()).expiry_warnings(NOW).expect("reads");
     let [warning] = &warned()[..] else { panic!("{:?}", warned()) };
-    assert!(
-        warning.contains("root metadata expired at 1974-12-31") && warning.contains("keys renew"),
-        "{warning}"
-    );
+    let holds = warning.contains("root metadata expired at 1974-12-31") && warning.contains("keys renew");
+    assert!(holds, "{warning}");
     let metadata = Metadata::open(dir.path()).expect("opens");
     metadata.refresh(NOW, 30).expect("signs");
     assert!(is_refused(&mut kept), "a refresh does not help");
@@ -173,10 +171,8 @@ fn a_key_that_the_root_does_not_name_signs_nothing() {
     let (dir, _store) = published(NOW);
     fs_err::write(dir.path().join("keys/timestamp.key"), "07".repeat(32)).expect("written");
     let refused = Metadata::open(dir.path()).expect("opens").refresh(NOW, 1);
-    assert!(
-        matches!(refused, Err(StoreError::RoleKey { ref role, .. }) if role == "timestamp"),
-        "{refused:?}"
-    );
+    let holds = matches!(refused, Err(StoreError::RoleKey { ref role, .. }) if role == "timestamp");
+    assert!(holds, "{refused:?}");
 }
 
 #[test]

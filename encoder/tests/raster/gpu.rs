@@ -38,13 +38,9 @@ fn chunks_and_bands_change_no_bit() {
         (60_000, 0, 1 << 19),
         (1 << 27, u64::MAX, 100),
     ] {
-        let cut = open(GpuOptions {
-            max_binding_bytes,
-            max_resident_bytes,
-            first_capacity,
-            ..GpuOptions::default()
-        })
-        .unwrap();
+        let default = GpuOptions::default();
+        let options = GpuOptions { max_binding_bytes, max_resident_bytes, first_capacity, ..default };
+        let cut = open(options).unwrap();
         let (whole, cut) = (whole.load(&scene).unwrap(), cut.load(&scene).unwrap());
         for (width, height) in SIZES_PX {
             let mut view = view;

@@ -76,12 +76,8 @@ pub fn image_graph(floats: Element, batch: i64, divides: bool) -> Graph {
         node("MatMul", &["colour", "weights"], last, &[]),
     ];
     if divides {
-        nodes.push(node(
-            "ReduceMax",
-            &["pixel_values"],
-            "largest",
-            &[("axes", &[0, 1, 2, 3]), ("keepdims", &[0])],
-        ));
+        let attributes: [(&str, &[i64]); 2] = [("axes", &[0, 1, 2, 3]), ("keepdims", &[0])];
+        nodes.push(node("ReduceMax", &["pixel_values"], "largest", &attributes));
         nodes.push(node("Div", &["undivided", "largest"], "image_embeds", &[]));
     }
     Graph {

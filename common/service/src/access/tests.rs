@@ -8,12 +8,7 @@ fn local() -> Listen {
     "127.0.0.1:7734".parse().expect("an address")
 }
 
-fn access(
-    listen: &str,
-    hosts: &[&str],
-    origins: &[&str],
-    token: Option<&str>,
-) -> Result<Access, AccessError> {
+fn access(at: &str, hosts: &[&str], origins: &[&str], token: Option<&str>) -> Result<Access, AccessError> {
     let owned = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect();
     let dir = tempfile::tempdir().expect("a folder");
     let file = dir.path().join("slag-token");
@@ -22,7 +17,7 @@ fn access(
     }
     let settings =
         AccessSettings { hosts: owned(hosts), origins: owned(origins), token_file: token.map(|_| file) };
-    Access::new(&listen.parse().expect("an address"), settings)
+    Access::new(&at.parse().expect("an address"), settings)
 }
 
 fn status(access: &Access, method: Method, headers: &[(&str, &str)]) -> u16 {

@@ -238,10 +238,8 @@ async fn stopping_has_a_deadline() {
 async fn an_occupied_address_is_an_error_that_names_it() {
     let running = start(ConnectionLimits::default()).await;
     let refused = bind(&running.address.into()).await.expect_err("taken").to_string();
-    assert!(
-        refused.contains(&running.address.to_string()) && refused.contains("another address"),
-        "{refused}"
-    );
+    let holds = refused.contains(&running.address.to_string()) && refused.contains("another address");
+    assert!(holds, "{refused}");
 }
 
 #[test]

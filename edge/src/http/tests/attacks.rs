@@ -39,48 +39,25 @@ async fn web_pages_neither_write_nor_read() {
     let service = Service::with_chair();
     let (app, following) = following_app(&service, Access::default());
     let json = ("content-type", "application/json");
+    let form = ("content-type", "application/x-www-form-urlencoded");
+    let utf16 = ("content-type", "application/json; Charset=\"utf-16\"");
+    let evil = ("origin", "https://evil.example");
+    let no_cors = [("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors")];
     let problem = |kind: &str| Value::String(format!("urn:slag:problem:{kind}"));
     for (method, uri, headers, status, kind) in [
         ("POST", "/position", &[("content-type", "text/plain")][..], 415, "unsupported-media-type"),
-        (
-            "POST",
-            "/position",
-            &[("content-type", "application/x-www-form-urlencoded")],
-            415,
-            "unsupported-media-type",
-        ),
+        ("POST", "/position", &[form], 415, "unsupported-media-type"),
         ("POST", "/position", &[], 415, "unsupported-media-type"),
-        (
-            "POST",
-            "/position",
-            &[("content-type", "application/json; Charset=\"utf-16\"")],
-            415,
-            "unsupported-media-type",
-        ),
-        ("POST", "/position", &[json, ("origin", "https://evil.example")], 403, "foreign-origin"),
+        ("POST", "/position", &[utf16], 415, "unsupported-media-type"),
+        ("POST", "/position", &[json, evil], 403, "foreign-origin"),
         ("POST", "/position", &[json, ("origin", "null")], 403, "foreign-origin"),
         ("POST", "/position", &[json, ("host", "evil.example")], 421, "wrong-host"),
         ("GET", "/status", &[("host", "evil.example:7734")], 421, "wrong-host"),
-        (
-            "GET",
-            "/query?text=0",
-            &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors")],
-            403,
-            "foreign-origin",
-        ),
-        (
-            "OPTIONS",
-            "/position",
-            &[("origin", "https://evil.example"), ("access-control-request-method", "POST")],
-            403,
-            "foreign-origin",
-        ),
+        ("GET", "/query?text=0", &no_cors, 403, "foreign-origin"),
+        ("OPTIONS", "/position", &[evil, ("access-control-request-method", "POST")], 403, "foreign-origin"),
     ] {
-        assert_eq!(
-            ask(&app, method, uri, headers).await,
-            (status, problem(kind)),
-            "{method} {uri} {headers:?}"
-        );
+        let answer = ask(&app, method, uri, headers).await;
+        assert_eq!(answer, (status, problem(kind)), "{method} {uri} {headers:?}");
     }
     assert_eq!(following.status().position, None, "nothing moved the robot");
     assert_eq!(ask(&app, "POST", "/position", &[json]).await.0, 202);
@@ -234,11 +211,8 @@ async fn a_follower_that_panics_is_reported_and_begins_again() {
     let down = Value::String("urn:slag:problem:follower-failed".into());
     assert_eq!(ask(&app, "GET", "/readyz", &[]).await, (503, down.clone()));
     assert_eq!(ask(&app, "POST", "/position", &json).await, (503, down));
-    assert_eq!(
-        following.status().position,
-        Some(Position::World(DVec3::new(1.0, 2.0, 3.0))),
-        "kept all the same"
-    );
+    let found = following.status().position;
+    assert_eq!(found, Some(Position::World(DVec3::new(1.0, 2.0, 3.0))), "kept all the same");
     let metrics = read(service_of(&app, "/metrics").await).await.2;
     let metrics = metrics.as_str().expect("text");
     let restarts = following.status().n_restarts;

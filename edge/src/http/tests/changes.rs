@@ -164,8 +164,7 @@ async fn changes_are_placed_on_the_earth() {
     write_manifest(service.dir.path(), &shards, manifest);
     service.app.reload_now();
     let went = async |query: &str| {
-        let (status, _, body) = service.get(&format!("/v1/changes?{query}")).await;
-        assert_eq!(status, StatusCode::OK, "{body:#}");
+        let body = service.ok(&format!("/v1/changes?{query}")).await;
         body["went"].clone()
     };
     // 10 m east of the origin lies the object that went.

@@ -46,8 +46,7 @@ async fn poses_or_reasons_are_given() {
     let shards = room_with(Some(&places()));
     let service = Service::new(Some(&shards), Settings::default());
     // The mug on the floor is seen; the one on the table is too high, and is named as missed or comes second.
-    let (status, _, body) = service.get("/v1/goal?id=o0000000000000002&near=2,3,0&step_m=0.15").await;
-    assert_eq!(status, StatusCode::OK, "{body:#}");
+    let body = service.ok("/v1/goal?id=o0000000000000002&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &body);
     let goal = &body["goals"][0];
     let at = |name: &str, axis: usize| goal[name][axis].as_f64().expect("a number");
@@ -77,8 +76,7 @@ async fn poses_or_reasons_are_given() {
     let mut kinds = Vec::new();
     for heading_rad in [0.0, std::f64::consts::FRAC_PI_2, std::f64::consts::PI, -std::f64::consts::FRAC_PI_2]
     {
-        let (status, _, body) = service.get(&format!("{of_side}&heading_rad={heading_rad}")).await;
-        assert_eq!(status, 200, "{body:#}");
+        let body = service.ok(&format!("{of_side}&heading_rad={heading_rad}")).await;
         kinds.push(body["none"]["kind"].as_str().unwrap_or("found").to_owned());
     }
     assert!(kinds.iter().any(|kind| kind == "no-such-thing"), "{kinds:?}");
@@ -96,8 +94,7 @@ async fn groups_of_gaussians_are_gone_to() {
     let (_, _, found) = service.get("/v1/query?text=1").await;
     let id = &found["results"][0]["answers"][0]["id"];
     assert!(id.as_str().is_some_and(|id| !id.starts_with('o')), "{found:#}");
-    let (status, _, body) = service.get("/v1/goal?text=1&near=2,3,0&step_m=0.15").await;
-    assert_eq!(status, StatusCode::OK, "{body:#}");
+    let body = service.ok("/v1/goal?text=1&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &body);
     assert_eq!((&body["thing"]["id"], body["none"].is_null()), (id, true), "{body:#}");
     let goal = &body["goals"][0];

@@ -65,8 +65,7 @@ async fn things_have_their_own_pictures() {
 }
 
 async fn ids_of(service: &Service, query: &str) -> Vec<String> {
-    let (status, _, page) = service.get(&format!("/v1/objects?{query}")).await;
-    assert_eq!(status, StatusCode::OK, "{query}: {page}");
+    let page = service.ok(&format!("/v1/objects?{query}")).await;
     let objects = page["objects"].as_array().expect("a list");
     objects.iter().map(|object| object["id"].as_str().expect("an id").to_owned()).collect()
 }

@@ -68,14 +68,11 @@ const TABLE: &str = "o0000000000000003";
 #[tokio::test]
 async fn get_and_post_answer_in_one_shape() {
     let service = Service::new(Some(&room()), Settings::default());
-    let (status, _, got) = service.get("/v1/query?text=0&text=1&near=0,0,0").await;
-    assert_eq!(status, StatusCode::OK, "{got}");
+    let got = service.ok("/v1/query?text=0&text=1&near=0,0,0").await;
     let (status, _, posted) = post(&service, &json!({"texts": ["0", "1"], "near": [0, 0, 0]})).await;
     assert_eq!((status, &got), (StatusCode::OK, &posted));
-    assert_eq!(
-        (&got["scene"], &got["generation"], &got["frame"], &got["unit"]),
-        (&json!("yard"), &json!(1), &json!("world"), &json!("m"))
-    );
+    let found = (&got["scene"], &got["generation"], &got["frame"], &got["unit"]);
+    assert_eq!(found, (&json!("yard"), &json!(1), &json!("world"), &json!("m")));
     let (_, _, one) = service.get("/v1/query?text=1&near=0,0,0").await;
     assert_eq!(one["results"][0], got["results"][1], "one question has the shape of many");
     assert_eq!(ids(&got["results"][0]), [MUG_ON_TABLE, MUG_ON_FLOOR]);
@@ -407,18 +404,14 @@ async fn things_on_board_are_listed_in_pages() {
         assert_eq!(service.get(&format!("/v1/{bad}")).await.0, StatusCode::BAD_REQUEST, "{bad}");
     }
     let (_, _, map) = service.get("/v1/map").await;
-    assert_eq!(
-        (&map["n_objects"], &map["cells"][0]["generation"], &map["missing"], &map["z_is_up"]),
-        (&json!(3), &json!(1), &json!([]), &json!(true))
-    );
+    let found = (&map["n_objects"], &map["cells"][0]["generation"], &map["missing"], &map["z_is_up"]);
+    assert_eq!(found, (&json!(3), &json!(1), &json!([]), &json!(true)));
     // Before the generation's time (the robot's clock is behind) there is no age.
     let snapshot = service.app.engine.snapshot().expect("loaded");
     let made = snapshot.manifest.created_unix_secs;
     let at = |now| map_status(&snapshot, now, Some(made + 30));
-    assert_eq!(
-        [made - 60, made + 60].map(|now| (at(now).age_secs, at(now).is_expired)),
-        [(0, false), (60, true)]
-    );
+    let found = [made - 60, made + 60].map(|now| (at(now).age_secs, at(now).is_expired));
+    assert_eq!(found, [(0, false), (60, true)]);
 }
 
 #[tokio::test]

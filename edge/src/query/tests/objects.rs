@@ -3,6 +3,10 @@ use slag_api::objects::Evidence;
 use super::*;
 use crate::testing::TestObject;
 
+fn two_cells() -> [BuiltShard; 2] {
+    [(3, 20.0, 100), (4, 22.0, 60)].map(|(id, x, n)| thing(id, DVec3::X * x, n, 0.9).build(false))
+}
+
 /// Cells 3 and 4 share object 21 (30 Gaussians and 12 of 50 in all); cell 4 has object 22 too.
 fn scene_of_objects() -> Vec<BuiltShard> {
     let [a, b, c] = [[1.0f32, 0.0], [0.6, 0.8], [0.0, 1.0]];
@@ -14,9 +18,7 @@ fn scene_of_objects() -> Vec<BuiltShard> {
     };
     let shared = |runs: &[std::ops::Range<u32>]| object(21, [b, a, c], runs, 50);
     let calibration = Calibration { score_mean: 0.1, score_spread: 0.1 };
-    let built =
-        [thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9), thing(4, DVec3::new(22.0, 0.0, 0.0), 60, 0.9)];
-    let built = built.map(|thing| thing.build(false));
+    let built = two_cells();
     vec![
         built[0].with_objects(&[shared(&[10..25, 25..40])], calibration),
         built[1].with_objects(
@@ -63,9 +65,7 @@ fn objects_answer_first_and_once() {
         ask(built, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Clusters), Some(0.5)))
             .answers
     };
-    let without =
-        [thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9), thing(4, DVec3::new(22.0, 0.0, 0.0), 60, 0.9)];
-    assert_eq!(clusters_of(&scene), clusters_of(&without.map(|thing| thing.build(false))));
+    assert_eq!(clusters_of(&scene), clusters_of(&two_cells()));
 }
 
 /// By hand: the best object has 0.8, the best Gaussians 0.9.
@@ -188,10 +188,8 @@ fn reasons_are_of_the_region() {
     for kind in [objects, None] {
         let low = reason(22.195, 22.6, 1, kind);
         assert_eq!(low.kind, ReasonKind::BelowThreshold, "{}", low.detail);
-        assert!(
-            low.best_score.is_some_and(|score| score < 0.1) && low.detail.contains("in the box"),
-            "{low:?}"
-        );
+        let holds = low.best_score.is_some_and(|score| score < 0.1) && low.detail.contains("in the box");
+        assert!(holds, "{low:?}");
         let of_none = reason(20.5, 20.9, 1, kind);
         assert_eq!(of_none.kind, ReasonKind::BelowThreshold, "{}", of_none.detail);
         // Without objects the nearest miss is among the Gaussians.

@@ -118,15 +118,8 @@ fn lift(
 ) -> Lifted {
     let Scene { index, table, .. } = &open(views, dim, &[N], u64::MAX);
     let (gaussians, split, cancel) = (&gaussians(), &split(), &AtomicBool::new(false));
-    let scene = SceneContributions {
-        index,
-        gaussians,
-        split,
-        standing: &Standing::default(),
-        photos,
-        group_bytes,
-        cancel,
-    };
+    let standing = &Standing::default();
+    let scene = SceneContributions { index, gaussians, split, standing, photos, group_bytes, cancel };
     let pending = PendingRefinement::begin(settings, &scene, table.clone()).expect("reads");
     let (table, refinement) = pending.finish(&scene, &object_of()).expect("reads");
     let raw = index.read(0..1).expect("reads");

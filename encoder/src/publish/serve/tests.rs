@@ -44,6 +44,12 @@ fn fixture() -> Fixture {
     fixture
 }
 
+fn served() -> (Fixture, Router) {
+    let fixture = fixture();
+    let router = fixture.router_within(Limits::default()).expect("published");
+    (fixture, router)
+}
+
 impl Fixture {
     fn listed(&self, range: std::ops::Range<usize>) -> Vec<(Hash32, u64)> {
         self.shards[range].iter().map(|(hash, bytes)| (*hash, bytes.len() as u64)).collect()
@@ -54,10 +60,6 @@ impl Fixture {
         let targets = fs_err::read(self.dir.path().join("metadata/2.targets.json")).expect("there");
         let targets: Value = serde_json::from_slice(&targets).expect("JSON");
         targets["signed"]["targets"]["manifest"]["hashes"]["sha256"].as_str().expect("text").to_owned()
-    }
-
-    fn router(&self) -> Router {
-        self.router_within(Limits::default()).expect("published")
     }
 
     fn router_within(&self, limits: Limits) -> Result<Router, StoreError> {
@@ -114,8 +116,7 @@ async fn get_with(router: &Router, path: &str, headers: &[(&str, &str)]) -> Answ
 
 #[tokio::test]
 async fn manifest_is_tagged() {
-    let fixture = fixture();
-    let router = fixture.router();
+    let (_fixture, router) = served();
     let answer = get_with(&router, "/v1/manifest", &[]).await;
     assert_eq!(answer.status, StatusCode::OK);
     assert_eq!(Manifest::parse(&answer.body).expect("a manifest").generation, 2);
@@ -134,8 +135,7 @@ async fn manifest_is_tagged() {
 
 #[tokio::test]
 async fn objects_in_whole_and_in_part() {
-    let fixture = fixture();
-    let router = fixture.router();
+    let (fixture, router) = served();
     // Only the previous manifest lists shard 0.
     for (hash, bytes) in &fixture.shards {
         let answer = get_with(&router, &format!("/v1/objects/{hash}"), &[]).await;
@@ -189,8 +189,7 @@ async fn objects_in_whole_and_in_part() {
 
 #[tokio::test]
 async fn only_what_is_listed_is_served() {
-    let fixture = fixture();
-    let router = fixture.router();
+    let (fixture, router) = served();
     for path in [
         format!("/v1/objects/{}", fixture.extra),
         format!("/v1/objects/{}", Hash32::of(b"unknown")),
@@ -214,7 +213,7 @@ async fn only_what_is_listed_is_served() {
 
 #[tokio::test]
 async fn only_reading_without_bodies() {
-    let router = fixture().router();
+    let (_fixture, router) = served();
     let post = Request::post("/v1/manifest").body(Body::empty()).expect("a request");
     let answer = ask(&router, post).await;
     answer.problem(StatusCode::METHOD_NOT_ALLOWED);
@@ -238,7 +237,7 @@ async fn cells_near_a_point() {
         .collect();
     let unplaced = Manifest { generation: 3, ..manifest_of_boxes(&boxes) };
     fixture.store.publish(&unplaced, &Extras::new()).expect("publishes");
-    let router = fixture.router();
+    let router = fixture.router_within(Limits::default()).expect("published");
     let at = "lat=46.8427&lon=-91.9940&radius=20";
     let detail = get_with(&router, &format!("/v1/cells?{at}"), &[]).await.problem(StatusCode::BAD_REQUEST);
     assert!(detail.contains("not geo-referenced"), "{detail}");
@@ -287,8 +286,7 @@ async fn cells_near_a_point() {
 
 #[tokio::test]
 async fn coverage_needs_a_place_on_the_earth() {
-    let fixture = fixture();
-    let router = fixture.router();
+    let (fixture, router) = served();
     let answer = get_with(&router, "/v1/coverage.geojson", &[]).await;
     assert!(answer.problem(StatusCode::CONFLICT).contains("not geo-referenced"));
     let origin = Geographic { latitude_deg: 46.842657, longitude_deg: -91.994008, height_m: 158.5 };
@@ -303,8 +301,7 @@ async fn coverage_needs_a_place_on_the_earth() {
 
 #[tokio::test]
 async fn new_manifest_is_noticed_and_a_damaged_one_is_not_served() {
-    let fixture = fixture();
-    let router = fixture.router();
+    let (fixture, router) = served();
     let generation =
         async |router: &Router| get_with(router, "/healthz", &[]).await.json()["generation"].clone();
     assert_eq!(generation(&router).await, 2);
@@ -375,10 +372,8 @@ async fn a_page_alone_is_found_from_the_root() {
     let root = get_with(&router, "/", &[]).await;
     assert_eq!((root.status.as_u16(), root.header(header::LOCATION)), (307, "/view"));
     let detail = get_with(&router, "/nowhere", &[]).await.problem(StatusCode::NOT_FOUND);
-    assert!(
-        detail.contains("\"/nowhere\"") && detail.contains("/view") && !detail.contains("GET /"),
-        "{detail}"
-    );
+    let holds = detail.contains("\"/nowhere\"") && detail.contains("/view") && !detail.contains("GET /");
+    assert!(holds, "{detail}");
     let fixture = fixture();
     let router = fixture.router_within(Limits::default()).expect("published");
     assert_eq!(get_with(&router, "/", &[]).await.status, StatusCode::OK);
@@ -402,8 +397,7 @@ async fn downloads_are_counted_until_they_end() {
 
 #[tokio::test]
 async fn every_described_resource_and_parameter_is_answered() {
-    let fixture = fixture();
-    let router = fixture.router();
+    let (fixture, router) = served();
     let (_, table) = router::described();
     assert!(table.len() >= 7, "{table:?}");
     for route in &table {

@@ -468,10 +468,8 @@ mod tests {
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| scene.take_workspace().is_some());
             scene.return_workspace(Some(scene.make_workspace(small, 1, 1).expect("there is memory")));
-            assert!(
-                waiting.join().expect("no panic"),
-                "the view that waited has the one that was given back"
-            );
+            let holds = waiting.join().expect("no panic");
+            assert!(holds, "the view that waited has the one that was given back");
         });
     }
 }

@@ -142,16 +142,12 @@ struct Oracle {
 impl Oracle {
     /// First and last column and row, as x0, y0, x1, y1.
     fn box_of(&self, inside: &[bool]) -> [i64; 4] {
-        let pixels = || inside.iter().enumerate().filter(|(_, inside)| **inside).map(|(at, _)| at);
-        let (x, y) = (|at| (at % self.image_px[0]) as i64, |at| (at / self.image_px[0]) as i64);
-        let least = |values: &mut dyn Iterator<Item = i64>| values.min().expect("not empty");
-        let most = |values: &mut dyn Iterator<Item = i64>| values.max().expect("not empty");
-        [
-            least(&mut pixels().map(x)),
-            least(&mut pixels().map(y)),
-            most(&mut pixels().map(x)),
-            most(&mut pixels().map(y)),
-        ]
+        let width = self.image_px[0] as i64;
+        let pixels = (0..).zip(inside).filter(|(_, inside)| **inside).map(|(at, _)| (at % width, at / width));
+        let (x, y): (Vec<i64>, Vec<i64>) = pixels.unzip();
+        let least = |values: &[i64]| *values.iter().min().expect("not empty");
+        let most = |values: &[i64]| *values.iter().max().expect("not empty");
+        [least(&x), least(&y), most(&x), most(&y)]
     }
 
     fn nms(
@@ -261,13 +257,8 @@ impl Oracle {
                 continue;
             }
             let level = [2, 1, 0][at % 3];
-            masks.push(Dense {
-                inside,
-                predicted_iou: f64::from(blob.predicted_iou),
-                level,
-                crop,
-                healed: false,
-            });
+            let predicted_iou = blob.predicted_iou.into();
+            masks.push(Dense { inside, predicted_iou, level, crop, healed: false });
         }
         self.nms(masks, |mask| mask.predicted_iou, |a, b| self.box_iou(a, b) > settings.box_nms_iou)
     }
@@ -332,9 +323,13 @@ fn compare(settings: SamSettings, image_px: [u32; 2], n_prompts: usize, seed: u6
     found.len()
 }
 
+fn without_filters() -> SamSettings {
+    SamSettings { predicted_iou: 0.0, stability: 0.0, box_nms_iou: 1.0, ..SamSettings::default() }
+}
+
 #[test]
 fn the_filters_equal_a_plain_recomputation() {
-    let all = SamSettings { predicted_iou: 0.0, stability: 0.0, box_nms_iou: 1.0, ..SamSettings::default() };
+    let all = without_filters();
     let image_px = [230, 170];
     let n = |settings: &SamSettings| compare(settings.clone(), image_px, 24, 7);
     let n_all = n(&all);
@@ -434,13 +429,7 @@ fn healing_of_noise_equals_a_plain_recomputation() {
 
 #[test]
 fn crops_equal_a_plain_recomputation() {
-    let all = SamSettings {
-        predicted_iou: 0.0,
-        stability: 0.0,
-        box_nms_iou: 1.0,
-        crop_nms_iou: 1.0,
-        ..SamSettings::default()
-    };
+    let all = SamSettings { crop_nms_iou: 1.0, ..without_filters() };
     for (crop_layers, image_px) in [(1, [300, 211]), (2, [181, 260])] {
         let settings = SamSettings { crop_layers, ..all.clone() };
         let n_all = compare(settings.clone(), image_px, 8, 3);

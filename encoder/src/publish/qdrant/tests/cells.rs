@@ -44,8 +44,7 @@ impl Fixture {
 
 #[tokio::test]
 async fn each_cell_has_its_collection_with_its_points_and_settings() {
-    let fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (fixture, server, url) = started().await;
     let index = IndexSettings { hnsw_m: Some(0), ..IndexSettings::default() };
     let options = PushOptions { index, ..cells(&url) };
     let (report, seen) = fixture.push_until(&options, std::future::pending()).await.expect("pushes");
@@ -71,8 +70,7 @@ async fn each_cell_has_its_collection_with_its_points_and_settings() {
 /// A dropped cell, or one with a lost point, is pushed again; the others stay.
 #[tokio::test]
 async fn a_cell_is_repaired_alone() {
-    let fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (fixture, server, url) = started().await;
     fixture.push(&cells(&url)).await.expect("pushes");
     server.with(|state| state.collections.remove(NAMES[0]));
     // Cut off in the new collection: the old one's record must not count.
@@ -91,8 +89,7 @@ async fn a_cell_is_repaired_alone() {
 
 #[tokio::test]
 async fn a_new_generation_replaces_cells_and_deletes_those_it_lacks() {
-    let mut fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (mut fixture, server, url) = started().await;
     fixture.push(&cells(&url)).await.expect("pushes");
     // Of an earlier generation pushed from elsewhere, of another scene, empty, and of other names.
     let others = [
@@ -141,8 +138,7 @@ async fn a_new_generation_replaces_cells_and_deletes_those_it_lacks() {
 /// The last cell's collection is foreign: nothing is written to the first ones, either.
 #[tokio::test]
 async fn foreign_cells_are_refused_before_anything_is_written() {
-    let fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (fixture, server, url) = started().await;
     server.with(|state| state.collections.insert(NAMES[2].into(), held_of("attic")));
     let refused = fixture.push(&cells(&url)).await.expect_err("another scene");
     let PushError::OtherScene { collection, n_points: 1, .. } = &refused else { panic!("{refused}") };
@@ -167,8 +163,7 @@ fn snapshot(collection: &str, number: usize, n_points: u64) -> Snapshot {
 
 #[tokio::test]
 async fn each_collection_has_a_snapshot_of_its_generation() {
-    let fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (fixture, server, url) = started().await;
     assert_eq!(fixture.push(&cells(&url)).await.expect("pushes").snapshots, [], "none unless asked");
     let options = PushOptions { snapshots: true, ..cells(&url) };
     server.with(|state| state.n_snapshots_allowed = Some(2));

@@ -83,8 +83,7 @@ async fn a_collection_is_created_with_the_settings_given_and_no_others() {
 
 #[tokio::test]
 async fn a_collection_of_other_settings_is_changed_only_where_asked() {
-    let fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (fixture, server, url) = started().await;
     fixture.push(&options(&url)).await.expect("pushes");
     let options = PushOptions { index: ALL, ..options(&url) };
     let report = fixture.push(&options).await.expect("changes");

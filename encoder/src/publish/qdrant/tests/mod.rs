@@ -207,6 +207,11 @@ fn options(url: &str) -> PushOptions {
     options
 }
 
+async fn started() -> (Fixture, Server, String) {
+    let (server, url) = Server::start(None).await;
+    (fixture(), server, url)
+}
+
 #[tokio::test]
 async fn every_point_arrives() {
     let fixture = fixture();
@@ -226,10 +231,8 @@ async fn every_point_arrives() {
     assert_eq!(seen.len(), N_BATCHES);
     assert_eq!(seen.last(), Some(&PushProgress { n_points: N_POINTS, n_points_expected: N_POINTS }));
     fixture.assert_arrived(&server, 1);
-    assert_eq!(
-        server.with(|state| state.collections["yard"].indexed.clone()),
-        ["scene", "generation", "location"]
-    );
+    let found = server.with(|state| state.collections["yard"].indexed.clone());
+    assert_eq!(found, ["scene", "generation", "location"]);
 }
 
 /// The client itself repeats once, so it takes three failures in a row to need our repetition.
@@ -310,8 +313,7 @@ async fn missing_payload_indexes_are_made_by_the_next_push() {
 
 #[tokio::test]
 async fn a_new_generation_starts_over_and_replaces() {
-    let mut fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (mut fixture, server, url) = started().await;
     fixture.push(&options(&url)).await.expect("pushes");
     fixture.publish(2, 30);
     let report = fixture.push(&options(&url)).await.expect("pushes");
@@ -332,8 +334,7 @@ async fn a_new_generation_starts_over_and_replaces() {
 
 #[tokio::test]
 async fn collections_that_do_not_fit_are_refused() {
-    let fixture = fixture();
-    let (server, url) = Server::start(None).await;
+    let (fixture, server, url) = started().await;
     for (dim, distance) in [(DIM as u64 + 1, Distance::Cosine), (DIM as u64, Distance::Dot)] {
         let params = VectorParamsBuilder::new(dim, distance).build();
         server.with(|state| state.collections.insert("yard".into(), server::Held::new(params)));
@@ -347,11 +348,8 @@ async fn collections_that_do_not_fit_are_refused() {
     server.with(|state| state.collections.insert("yard".into(), cells::held_of("attic")));
     let refused = fixture.push(&options(&url)).await.expect_err("another scene");
     assert!(matches!(refused, PushError::OtherScene { n_points: 1, .. }), "{refused}");
-    assert_eq!(
-        server.with(|state| (state.collections["yard"].points.len(), state.acknowledged.len())),
-        (1, 0),
-        "untouched"
-    );
+    let found = server.with(|state| (state.collections["yard"].points.len(), state.acknowledged.len()));
+    assert_eq!(found, (1, 0), "untouched");
 }
 
 #[tokio::test]
