@@ -15,7 +15,7 @@ use slag_common::{Gaussians, durable};
 use crate::ingest::IngestError;
 use crate::raster::{LoadedScene, Rasterizer};
 use diagnosis::{ALIKE_DB, FLAWLESS_DB, Means, Samples, looks_alike};
-use view::{PLAIN_DB, at_width, mean, picture, picture_name};
+use view::{MIN_COVERAGE, PLAIN_DB, at_width, mean, picture, picture_name};
 
 pub(crate) use diagnosis::ViewCheck;
 pub use diagnosis::{CheckOptions, CheckReport};
@@ -82,7 +82,9 @@ where
             name: view.name.clone(),
             psnr_db: small.likeness_db(&drawing),
             flat_psnr_db: small.flat_psnr_db(),
-            covered_share: mean(drawing.coverage.iter().map(|&alpha| f64::from(u8::from(alpha > 0.5)))),
+            covered_share: mean(
+                drawing.coverage.iter().map(|&alpha| f64::from(u8::from(alpha > MIN_COVERAGE))),
+            ),
             visible_gaussians: drawing.counters.visible,
             is_far_below: false,
         });

@@ -60,6 +60,13 @@ pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
     -10.0 * mean(squares).max(1e-10).log10()
 }
 
+/// Largest variance of colours behind a splat, from 0 to 1: that of a sky without clouds. What shows through holes varies
+/// more.
+const MAX_BEHIND_VARIANCE: f64 = 0.01;
+
+/// Opacity above which a drawing shows the splat.
+pub(super) const MIN_COVERAGE: f32 = 0.5;
+
 /// PSNR against the mean colour from which a photo is plain, as under a lens cap, and tells nothing of the others.
 pub(super) const PLAIN_DB: f64 = 40.0;
 
@@ -71,24 +78,34 @@ impl CheckView {
             .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
     }
 
-    /// PSNR of a drawing against the photo, dB. Where the splat is transparent, the photo's mean colour there stands
-    /// behind it: a splat need not show the sky, or the backdrop of a thing.
+    /// PSNR of a drawing against the photo, dB. Where the splat shows nothing, it is black, or has the photo's mean colour
+    /// there if the photo is nearly plain there: a splat need not show the sky, or the backdrop of a thing.
     pub(super) fn likeness_db(&self, drawing: &Drawing) -> f64 {
-        let clear = |pixel: usize| f64::from(1.0 - drawing.coverage[pixel].clamp(0.0, 1.0));
-        let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| self.is_valid(*pixel));
-        let n_clear: f64 = pixels().map(|(pixel, _)| clear(pixel)).sum();
-        let behind: [f64; 3] = std::array::from_fn(|c| {
-            let sum: f64 = pixels().map(|(pixel, photo)| clear(pixel) * f64::from(photo[c]) / 255.0).sum();
-            sum / n_clear.max(1e-6)
-        });
-        self.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c] + (clear(pixel) * behind[c]) as f32)
+        let is_bare = |pixel: usize| drawing.coverage[pixel] <= MIN_COVERAGE;
+        let drawn = |pixel: usize, c: usize| drawing.rgb[pixel * 3 + c];
+        let on_black_db = self.psnr_db(drawn);
+        let bare = || self.image.pixels().enumerate().filter(|(at, _)| self.is_valid(*at) && is_bare(*at));
+        // Of a drawing of nothing, that would be the plain colour that drawings are to surpass.
+        if (0..drawing.coverage.len()).all(is_bare) {
+            return on_black_db;
+        }
+        let behind: [f32; 3] =
+            std::array::from_fn(|c| mean(bare().map(|(_, photo)| f64::from(photo[c]) / 255.0)) as f32);
+        let square = |photo: u8, c: usize| (f64::from(photo) / 255.0 - f64::from(behind[c])).powi(2);
+        if mean(bare().flat_map(|(_, photo)| (0..3).map(move |c| square(photo[c], c)))) > MAX_BEHIND_VARIANCE
+        {
+            return on_black_db;
+        }
+        let filled = |pixel, c| if is_bare(pixel) { behind[c] } else { drawn(pixel, c) };
+        on_black_db.max(self.psnr_db(filled))
     }
 
     /// Leaves out the pixels that the drawing does not cover.
     pub(super) fn leave_out(&mut self, drawing: &Drawing) {
         let (width_px, height_px) = self.image.dimensions();
         let valid = self.valid.get_or_insert_with(|| GrayImage::from_pixel(width_px, height_px, Luma([255])));
-        let bare = valid.pixels_mut().zip(&drawing.coverage).filter(|(_, coverage)| **coverage <= 0.5);
+        let bare =
+            valid.pixels_mut().zip(&drawing.coverage).filter(|(_, coverage)| **coverage <= MIN_COVERAGE);
         bare.for_each(|(pixel, _)| *pixel = Luma([0]));
     }
 
