@@ -313,8 +313,9 @@ pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T
 }
 
 pub(crate) fn read_text(path: &Path) -> Result<String, ModelError> {
-    let text = files::open(path).and_then(std::io::read_to_string);
-    text.map_err(|cause| ModelError::unreadable(&cause))
+    let bytes = files::read(path).map_err(|cause| ModelError::unreadable(&cause))?;
+    let text = files::text_of(&bytes).map_err(|cause| ModelError::at(path, cause))?;
+    Ok(text.to_owned())
 }
 
 fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, ModelError> {

@@ -2,7 +2,7 @@
 
 use std::{collections::HashMap, path::Path, sync::Arc};
 
-use slag_common::files;
+use crate::description::read_text;
 
 use crate::encoder::TextEncoder;
 use crate::error::{InferenceError, ModelError};
@@ -33,8 +33,7 @@ impl PhraseEncoder {
         (vectors, tensor): (&Path, &str),
         centre: Option<Vec<f32>>,
     ) -> Result<Self, ModelError> {
-        let text = files::open(phrases).and_then(std::io::read_to_string);
-        let text = text.map_err(|cause| ModelError::unreadable(&cause))?;
+        let text = read_text(phrases)?;
         let unfit =
             |index: usize, fault: String| ModelError::at(phrases, format_args!("line {}{fault}", index + 1));
         let lines: Vec<String> = text.lines().map(str::to_owned).collect();

@@ -6,8 +6,8 @@ use std::path::Path;
 use anyhow::anyhow;
 use clap::Args;
 use serde::Serialize;
-use slag_common::ByteSize;
 use slag_common::tuf::format_utc;
+use slag_common::{ByteSize, files};
 
 use super::args::{CacheArgs, ModelArgs, engine};
 use super::failure::Failure;
@@ -98,6 +98,10 @@ fn disk(cache: &EdgeCache) -> Finding {
     match cache.files().free_bytes(there) {
         Err(error) => Verdict::Missing.on("disk", format!("{error}; give another --cache")),
         Ok(free) => {
+            if let (true, Err(error)) = (dir.is_dir(), files::check_writable(&dir.join("lock"))) {
+                return Verdict::Note
+                    .on("disk", format!("{error}: it answers, but fetches cannot write there"));
+            }
             let verdict = if free < LITTLE_BYTES { Verdict::Note } else { Verdict::Ok };
             verdict.on("disk", format!("{} free for {}", ByteSize(free), dir.display()))
         }

@@ -357,6 +357,13 @@ mod tests {
     use slag_test_support::assert_error;
 
     #[test]
+    fn threads_are_few_for_each_processor() {
+        let n_processors = std::thread::available_parallelism().expect("known").get();
+        assert_eq!([n_threads(None), n_threads(Some(1))], [n_processors, 1]);
+        assert_eq!(n_threads(Some(100_000)), MOST_THREADS_EACH * n_processors);
+    }
+
+    #[test]
     fn a_wrong_time_to_sign_is_refused() {
         assert_eq!(parse_epoch(OsStr::new("1700000000")).expect("seconds"), 1_700_000_000);
         for wrong in ["", "yesterday", "-1", "1.5"] {

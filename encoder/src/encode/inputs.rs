@@ -1,7 +1,7 @@
 //! Scene, views and geo-reference as they were read, and the hash that tells two encodes apart.
 
-use std::collections::{BTreeMap, HashSet};
-use std::path::Path;
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -206,7 +206,7 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<(), EncodeE
 }
 
 fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError> {
-    for name in std::collections::BTreeSet::from_iter(names) {
+    for name in BTreeSet::from_iter(names) {
         let Some(at) = views.iter().position(|view| view.name == *name) else {
             let first = views.first().map_or("", |view| &view.name);
             return Err(EncodeError::Failed(format!(
@@ -252,10 +252,17 @@ fn find_views(
     Ok((found, skipped))
 }
 
-/// A file of this name with another ending.
-fn of_the_same_stem(path: &Path) -> Option<std::path::PathBuf> {
+/// Endings of photos that other programs read, too.
+const PHOTO_ENDINGS: &str = "heic heif avif tif tiff dng bmp gif jxl jp2 jpg jpeg png webp";
+
+/// A photo of this name with another ending.
+fn of_the_same_stem(path: &Path) -> Option<PathBuf> {
+    let is_photo = |other: &PathBuf| {
+        let ending = other.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        other.file_stem() == path.file_stem() && PHOTO_ENDINGS.split(' ').any(|of| of == ending)
+    };
     let files = fs_err::read_dir(path.parent()?).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
-    files.filter(|other| other.file_stem() == path.file_stem()).min()
+    files.filter(is_photo).min()
 }
 
 /// Version of plan and drawings; a change redraws them.
@@ -435,7 +442,6 @@ fn hashes_of_columns(scene: &Gaussians) -> [Hash32; 6] {
 
 #[cfg(test)]
 mod tests {
-    use std::path::{Path, PathBuf};
 
     use slag_models::{ModelDir, Provider, SessionOptions};
     use slag_test_support::assert_error;
@@ -450,6 +456,16 @@ mod tests {
     fn a_scene_of_too_many_cells_is_refused() {
         assert!(check_cells(65_536).is_ok());
         assert_error(check_cells(65_537), &["--cell-gaussians and --cell-width-m"]);
+    }
+
+    #[test]
+    fn a_photo_of_another_ending_is_found_and_no_other_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        for name in ["a.HEIC", "a.json", "b.txt"] {
+            fs_err::write(folder.path().join(name), "").expect("writes");
+        }
+        let [a, b] = ["a.jpg", "b.jpg"].map(|name| of_the_same_stem(&folder.path().join(name)));
+        assert_eq!((a, b), (Some(folder.path().join("a.HEIC")), None));
     }
 
     /// By hand: a camera with a photo of 400 x 300 px, absent, and two of 40 x 30 by their headers. Two are in work, 19

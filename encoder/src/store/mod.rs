@@ -141,9 +141,9 @@ fn by_the_system(error: &io::Error) -> Option<&'static str> {
     match error.kind() {
         Kind::StorageFull | Kind::QuotaExceeded => Some(FULL),
         Kind::PermissionDenied => Some("give this user the right to read and write there"),
-        Kind::IsADirectory | Kind::NotADirectory | Kind::DirectoryNotEmpty => {
-            Some("files and folders of other names than expected lie there; move them away")
-        }
+        Kind::IsADirectory | Kind::NotADirectory | Kind::DirectoryNotEmpty => Some(
+            "a file lies where the store has a folder, or a folder where it has a file; name another place, or move it away",
+        ),
         Kind::ReadOnlyFilesystem => Some("its disk takes no writes: mount it for writing, or use a copy"),
         _ => is_full().then_some(FULL),
     }

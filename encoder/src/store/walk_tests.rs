@@ -118,6 +118,9 @@ fn a_lost_root_is_not_made_anew_in_silence() {
     let refused = publish(dir.path(), 3).expect_err("no root");
     assert!(matches!(refused, StoreError::RootLost { .. }), "{refused}");
     assert!(refused.to_string().contains("v1/metadata/"), "{refused}");
+    let status = Metadata::open(dir.path()).and_then(|metadata| metadata.keys_status(dir.path()));
+    let status = status.expect_err("no root");
+    assert!(matches!(status, StoreError::RootLost { .. }), "{status}");
     // Nor where nothing but manifests, or the catalogue, tell that robots trust one.
     for lost in [&["metadata"][..], &["manifest", "manifest.previous"]] {
         lost.iter()

@@ -24,7 +24,10 @@ struct Annotation {
 }
 
 #[derive(Deserialize)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "a segmentation is {size: [height, width], counts}, counts a text or numbers from 0, or polygons"
+)]
 enum Segmentation {
     Runs {
         size: [u32; 2],

@@ -42,6 +42,9 @@ impl GivenMasks {
     pub fn open(path: &Path, ignore_ids: Vec<u32>) -> Result<Self, SegmentError> {
         let source = if files::metadata(path)?.is_dir() {
             Source::Folder(path.to_owned())
+        } else if path.extension().is_some_and(|ending| ending == "png") {
+            let expected = "expected a folder with a file for each photo, or a COCO data set in JSON";
+            return Err(SegmentError::of_file(path, expected));
         } else {
             let masks_of_image = coco::read_data_set(path)?;
             if let Some(told) = coco::without_pixels(path, masks_of_image.values().flatten()) {
