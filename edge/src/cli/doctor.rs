@@ -98,7 +98,7 @@ fn disk(cache: &EdgeCache) -> Finding {
     match cache.files().free_bytes(there) {
         Err(error) => Verdict::Missing.on("disk", format!("{error}; give another --cache")),
         Ok(free) => {
-            if let (true, Err(error)) = (dir.is_dir(), files::check_writable(&dir.join("lock"))) {
+            if let (true, Err(error)) = (dir.is_dir(), files::check_writable(&dir.join("doctor"))) {
                 return Verdict::Note
                     .on("disk", format!("{error}: it answers, but fetches cannot write there"));
             }

@@ -3,7 +3,7 @@
 use std::io::Cursor;
 
 use image::imageops::{self, FilterType};
-use image::{GrayImage, ImageFormat, Luma, RgbImage};
+use image::{GrayImage, ImageFormat, Luma, Rgb, RgbImage};
 
 use crate::ingest::{IngestError, LoadedImage};
 use crate::raster::{Drawing, LoadedScene, RasterError, RasterView};
@@ -84,15 +84,14 @@ impl CheckView {
         let is_bare = |pixel: usize| drawing.coverage[pixel] <= MIN_COVERAGE;
         let drawn = |pixel: usize, c: usize| drawing.rgb[pixel * 3 + c];
         let on_black_db = self.psnr_db(drawn);
-        let bare = || self.image.pixels().enumerate().filter(|(at, _)| self.is_valid(*at) && is_bare(*at));
         // Of a drawing of nothing, that would be the plain colour that drawings are to surpass.
         if (0..drawing.coverage.len()).all(is_bare) {
             return on_black_db;
         }
-        let behind: [f32; 3] =
-            std::array::from_fn(|c| mean(bare().map(|(_, photo)| f64::from(photo[c]) / 255.0)) as f32);
+        let behind = self.mean_colour(is_bare);
         let square = |photo: u8, c: usize| (f64::from(photo) / 255.0 - f64::from(behind[c])).powi(2);
-        if mean(bare().flat_map(|(_, photo)| (0..3).map(move |c| square(photo[c], c)))) > MAX_BEHIND_VARIANCE
+        if mean(self.pixels(is_bare).flat_map(|photo| (0..3).map(move |c| square(photo[c], c))))
+            > MAX_BEHIND_VARIANCE
         {
             return on_black_db;
         }
@@ -113,6 +112,18 @@ impl CheckView {
         self.flat_psnr_db() >= PLAIN_DB
     }
 
+    /// Pixels that belong to the photo, those of them that are asked for.
+    fn pixels(&self, is_asked_for: impl Fn(usize) -> bool) -> impl Iterator<Item = &Rgb<u8>> {
+        let all = self.image.pixels().enumerate();
+        all.filter(move |(at, _)| self.is_valid(*at) && is_asked_for(*at)).map(|(_, colour)| colour)
+    }
+
+    /// From 0 to 1.
+    fn mean_colour(&self, is_asked_for: impl Fn(usize) -> bool) -> [f32; 3] {
+        let of = |c: usize| self.pixels(&is_asked_for).map(move |colour| f64::from(colour[c]) / 255.0);
+        std::array::from_fn(|c| mean(of(c)) as f32)
+    }
+
     fn is_valid(&self, pixel: usize) -> bool {
         self.valid.as_ref().is_none_or(|valid| valid.as_raw()[pixel] > 0)
     }
@@ -130,9 +141,7 @@ impl CheckView {
     }
 
     pub(super) fn flat_psnr_db(&self) -> f64 {
-        let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| self.is_valid(*pixel));
-        let colour: [f32; 3] =
-            std::array::from_fn(|c| mean(pixels().map(|(_, p)| f64::from(p[c]) / 255.0)) as f32);
+        let colour = self.mean_colour(|_| true);
         self.psnr_db(|_, c| colour[c])
     }
 }

@@ -268,7 +268,7 @@ pub(crate) fn n_threads(asked: Option<u32>) -> usize {
     let most = MOST_THREADS_EACH * n_processors;
     match asked.map(|n| n as usize) {
         Some(n) if n > most => {
-            tracing::warn!("--threads {n} is taken as {most}: this machine has {n_processors} processors");
+            tracing::warn!("{n} threads are taken as {most}: this machine has {n_processors} processors");
             most
         }
         asked => asked.unwrap_or(n_processors),

@@ -210,7 +210,7 @@ async fn long_heads_are_refused() {
     assert!(received.starts_with(b"HTTP/1.1 431"), "{}", String::from_utf8_lossy(&received));
 }
 
-/// A client that does not read delays the stop until the deadline, an idle one not at all; what is read ends whole.
+/// A stop waits for a slow reader until the deadline, and not for an idle client. A download in progress ends whole.
 #[tokio::test]
 async fn stopping_has_a_deadline() {
     let drain_timeout = Duration::from_millis(60);

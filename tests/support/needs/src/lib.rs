@@ -19,7 +19,7 @@ pub fn needs_shared(_: TokenStream, test: TokenStream) -> TokenStream {
     marked(test, &["CI", "SLAG_SHARED"], is_ignored.then_some("needs the test data in ../shared"))
 }
 
-/// A test for `.ci/nightly`, which sets `SLAG_NIGHTLY`; the argument says why.
+/// A test that runs only where `SLAG_NIGHTLY` is set, as in `.ci/nightly`; the argument is the reason.
 #[proc_macro_attribute]
 pub fn nightly(why: TokenStream, test: TokenStream) -> TokenStream {
     let reason = format!("nightly: {}", why.to_string().trim_matches('"'));
@@ -40,7 +40,7 @@ fn marked(test: TokenStream, variables: &[&str], reason: Option<&str>) -> TokenS
     if let Some(reason) = reason.filter(|_| !has("[ignore")) {
         marked.extend(parsed(&format!("#[ignore = {reason:?}]")));
     }
-    // The last of several makes the test, when the marks of all are there.
+    // Where a test has several of these attributes, the last one adds `#[test]`.
     if !["needs_shared]", "needs_loop_disk]", "nightly("].map(has).contains(&true) {
         marked.extend(parsed("#[test]"));
     }
