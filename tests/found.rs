@@ -104,10 +104,21 @@ fn an_answer_on_the_encoder_is_a_splat() {
         assert!((0..3).all(|c| (found.scales[at][c] / scene.scales[index][c] - 1.0).abs() < 1e-5));
     }
 
-    // Another splat is refused; without indices, advice is given.
+    // The splat in another frame, as nerfstudio exports it.
     let mut moved = scene.clone();
-    moved.means_in_world.iter_mut().for_each(|mean| mean.x += 0.01);
+    moved
+        .means_in_world
+        .iter_mut()
+        .for_each(|mean| *mean = DVec3::new(0.2 * mean.y - 1.0, -0.2 * mean.x, 0.2 * mean.z));
     let other = dir.path().join("moved.ply");
+    ply::write(&other, &moved).expect("writes");
+    run_json(encoder(&query).args(["--scene", text(&other), "--ply", text(&files[1])]));
+    let found = splat::read(&files[1], &ReadOptions { with_sh_rest: true }).expect("a splat");
+    let expected = best_first.iter().map(|index| moved.means_in_world[*index as usize].as_vec3());
+    assert!(found.means_in_world.iter().map(DVec3::as_vec3).eq(expected));
+
+    // Another splat is refused; without indices, advice is given.
+    moved.means_in_world.reverse();
     ply::write(&other, &moved).expect("writes");
     let error = refused(encoder(&query).args(["--scene", text(&other)]), "moved.ply");
     assert!(error.contains("lies at"), "{error}");

@@ -3,6 +3,7 @@
 //! Instead of the crate `atomic-write-file`: it needs the final name first (objects are named by the hash of their
 //! content) and makes up temporary names, which a restart could not find and remove.
 
+use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
@@ -25,10 +26,15 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace(&part, path, bytes, Access::Shared)
 }
 
+/// Names may have 255 bytes, so long ones stand as their hash.
 fn part_of(path: &Path) -> PathBuf {
-    let mut part = path.as_os_str().to_owned();
+    let name = path.file_name().unwrap_or_default();
+    let mut part = match name.len() {
+        0..=250 => name.to_owned(),
+        _ => format!("{:016x}", BuildHasherDefault::<DefaultHasher>::default().hash_one(name)).into(),
+    };
     part.push(".part");
-    part.into()
+    path.with_file_name(part)
 }
 
 /// Writes a file that a user named; its old content stays until the new one is complete. Pipes, devices and
@@ -115,6 +121,16 @@ mod tests {
         }
         std::fs::remove_file(path).expect("written above");
         assert!(!std::fs::exists(format!("{name}.part")).expect("a path"));
+    }
+
+    #[test]
+    fn the_longest_names_are_written() {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        for name in ["a", "b"].map(|letter| letter.repeat(255)) {
+            write(&dir.path().join(&name), name.as_bytes()).expect("written");
+            write_result(&dir.path().join(&name), |out| out.write_all(b"new")).expect("written");
+        }
+        assert_eq!(std::fs::read_dir(dir.path()).expect("listed").count(), 2);
     }
 
     /// A result that fails half way leaves the old file, and no other.

@@ -11,6 +11,11 @@ pub fn error_line(error: &dyn std::error::Error) -> String {
         }
         cause = error.source();
     }
+    // Any command may fill a disk, and libraries hide the error's kind.
+    let is_full = ["No space left", "uota exceeded"].iter().any(|told| line.contains(told));
+    if is_full && !line.contains("free space") {
+        line.push_str("; free space on that disk, and run the same command again");
+    }
     line
 }
 
@@ -33,5 +38,16 @@ mod tests {
     fn an_error_names_its_file_and_cause_once() {
         let error = Scene(Open(io::Error::other("cannot open `a.json`: absent")));
         assert_eq!(error_line(&error), "scene: cannot open `a.json`: absent; check that the file exists");
+    }
+
+    #[test]
+    fn a_full_disk_has_its_advice_once() {
+        let line = error_line(&io::Error::from_raw_os_error(28));
+        assert_eq!(
+            line,
+            "No space left on device (os error 28); free space on that disk, and run the same command again"
+        );
+        let advised = Open(io::Error::other(line.clone()));
+        assert_eq!(error_line(&advised), format!("{line}; check that the file exists"));
     }
 }

@@ -191,6 +191,18 @@ fn colmap_errors_have_place_and_fault() {
     );
 }
 
+#[test]
+fn poses_that_are_no_file_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let json = dir.path().join("transforms.json");
+    std::os::unix::fs::symlink(&json, &json).unwrap();
+    assert_error(poses::read(dir.path(), None), &["/transforms.json: it is a folder, a pipe or a link"]);
+    assert_error(
+        poses::read(Path::new("/dev/null"), None),
+        &["/dev/null: it is neither a file nor a folder"],
+    );
+}
+
 /// Lines of features may be missing, names may have several words; images without a pose are omitted and named.
 #[test]
 fn every_image_of_a_model_is_read_or_named() {

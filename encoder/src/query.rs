@@ -264,7 +264,8 @@ fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<Store
     Ok(None)
 }
 
-/// Fails unless a store was encoded from this splat: compares its number of Gaussians, and some positions.
+/// Fails unless a store was encoded from this splat, perhaps in another frame: compares its number of Gaussians, and
+/// some positions.
 pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Result<(), StoreError> {
     let manifest = reader.manifest();
     let expected = manifest.n_gaussians + manifest.n_rejected;
@@ -276,20 +277,41 @@ pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Res
     }
     let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
     let error = shards.map(|shard| shard.position_error).fold(0.0, f64::max);
-    for Hit { index, position_in_world: expected, .. } in hits {
-        let found = scene.means_in_world[*index as usize];
-        let rounding = F32_ROUNDING * expected.abs().max_element();
-        // `NaN <= x` is false: NaN matches nothing.
-        let is_same = (found - *expected).abs().max_element() <= 1.01 * error + rounding;
-        if !is_same {
-            return Err(StoreError::Failed(format!(
-                "Gaussian {index} lies at {found} in the splat, at {expected} in the store; give the splat that the store was \
-                 encoded from"
-            )));
-        }
+    let found = |hit: &Hit| scene.means_in_world[hit.index as usize];
+    // Of the store and, in its units, of the splat.
+    let rounding = |scale: f64, hit: &Hit| {
+        F32_ROUNDING * (hit.position_in_world.abs().max_element() + found(hit).abs().max_element() / scale)
+    };
+    // `NaN <= x` is false: NaN matches nothing.
+    let is_same = |hit: &Hit| {
+        let off = (found(hit) - hit.position_in_world).abs().max_element();
+        off <= 1.01 * error + rounding(1.0, hit)
+    };
+    let Some(Hit { index, position_in_world: expected, .. }) = hits.iter().find(|hit| !is_same(hit)) else {
+        return Ok(());
+    };
+    // A similarity keeps the ratios of distances.
+    let from = |from: &Hit, hit: &Hit| {
+        (found(hit).distance(found(from)), hit.position_in_world.distance(from.position_in_world))
+    };
+    let first = &hits[0];
+    let far = hits.iter().max_by(|a, b| from(first, a).1.total_cmp(&from(first, b).1)).unwrap_or(first);
+    let scale = from(first, far).0 / from(first, far).1;
+    let keeps = |hit: &Hit, other: &Hit| {
+        let (found, expected) = from(other, hit);
+        (found / scale - expected).abs() <= 8.0 * (error + rounding(scale, hit))
+    };
+    if hits.len() >= LEAST_TO_COMPARE && hits.iter().all(|hit| keeps(hit, first) && keeps(hit, far)) {
+        return Ok(());
     }
-    Ok(())
+    Err(StoreError::Failed(format!(
+        "Gaussian {index} lies at {} in the splat, at {expected} in the store; give the splat that the store was encoded from",
+        scene.means_in_world[*index as usize]
+    )))
 }
+
+/// Positions that tell whether two splats are one in two frames.
+const LEAST_TO_COMPARE: usize = 6;
 
 /// A PLY of points with their ranks as answers.
 pub(crate) fn points_ply(hits: &[Hit], comments: &[String]) -> Vec<u8> {

@@ -131,6 +131,14 @@ def _same(before: Optional[int], now: int) -> int:
     return now
 
 
+def _only(reply: Reply) -> Result:
+    """Returns the result of the one text asked."""
+    results = reply.results or ()
+    if len(results) != 1:
+        raise _wrong(results, "one result")
+    return results[0]
+
+
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
     """Takes a redirect for what it is here, an error: the robot never redirects, so another machine answered."""
 
@@ -196,6 +204,8 @@ def _read(kind: Any, value: Any) -> Any:
     """Makes a value of a type of the messages out of JSON."""
     parts = [part for part in get_args(kind) if part is not type(None)]
     if is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise _wrong(value, "an object")
         hints = _hints(kind)
         keys = {name: _NAMES.get(name, name) for name in hints}
         made = {name: _read(hints[name], value[key]) for name, key in keys.items() if key in value}
@@ -207,7 +217,13 @@ def _read(kind: Any, value: Any) -> Any:
         return value
     if get_origin(kind) is Union:
         return _read(parts[0], value)
+    if not isinstance(value, list):
+        raise _wrong(value, "a list")
     return tuple(_read(parts[0], one) for one in value) if is_dataclass(parts[0]) else value
+
+
+def _wrong(value: Any, expected: str) -> SlagError:
+    return SlagError(200, {"detail": f"an answer has {_shown(repr(value).encode())} where {expected} belongs"})
 
 
 class Robot:
@@ -229,8 +245,8 @@ class Robot:
     def find(self, text: str, near: Optional[Point] = None, **request: Any) -> Result:
         """Asks for one text, which may name relations."""
         if near is not None:
-            request["near"] = near
-        return self.ask(texts=[text], **request).results[0]
+            request["near"] = near if isinstance(near, Mapping) else [float(of_axis) for of_axis in near]
+        return _only(self.ask(texts=[text], **request))
 
     def find_all(self, text: str, page: int = 100, **request: Any) -> Iterator[Answer]:
         """Yields all answers to a text, page by page; stops with an error if the generation changes meanwhile."""
@@ -239,13 +255,17 @@ class Robot:
         while offset is not None:
             reply = self.ask(texts=[text], limit=page, offset=offset, **request)
             generation = _same(generation, reply.generation)
-            yield from reply.results[0].answers
-            offset = reply.results[0].next_offset
+            result = _only(reply)
+            yield from result.answers
+            if result.next_offset is not None and not result.next_offset > offset:
+                raise SlagError(200, {"detail": f"the answers from {result.next_offset!r} on repeat themselves"})
+            offset = result.next_offset
 
     def objects(self, near: Optional[Sequence[float]] = None, **parameters: Any) -> Iterator[dict[str, Any]]:
         """Yields the things on board, page by page: near, radius, sort, min_size, limit as `GET /v1/objects` takes
         them; stops with an error if the generation changes meanwhile."""
         generation: Optional[int] = None
+        seen = {str(parameters.get("after"))}
         while True:
             query = urllib.parse.urlencode(_pairs(near, parameters))
             page = self._send("/v1/objects?" + query, members=("generation", "objects", "next_after"))
@@ -253,9 +273,10 @@ class Robot:
             yield from page["objects"]
             if page["next_after"] is None:
                 return
-            if page["next_after"] == parameters.get("after"):
+            if str(page["next_after"]) in seen:
                 raise SlagError(200, {"detail": f"the page after {page['next_after']!r} repeats itself"})
             parameters["after"] = page["next_after"]
+            seen.add(str(page["next_after"]))
 
     def object(self, id: str) -> dict[str, Any]:
         """Returns one thing on board."""
@@ -295,8 +316,11 @@ class Robot:
             texts = [texts]
         pairs = [("text", text) for text in texts] + _pairs(near, parameters)
         reply = self._send("/v1/changes?" + urllib.parse.urlencode(pairs), members=("from", "to", "frame", "none"))
-        earlier = None if reply["from"] is None else reply["from"]["generation"]
-        generations = {"from_generation": earlier, "to_generation": reply["to"]["generation"]}
+        both = [reply["from"] or {}, reply["to"]]
+        for generation in both:
+            if not isinstance(generation, dict):
+                raise _wrong(generation, "a generation")
+        generations = {"from_generation": both[0].get("generation"), "to_generation": both[1].get("generation")}
         changes: Changes = _read(Changes, {**reply, **generations})
         return replace(changes, more=reply)
 

@@ -105,6 +105,15 @@ def what_is_no_answer_is_an_error(robot: Robot) -> None:
     for _ in range(2):
         ANSWERS.append((200, {}, b'{"generation": 7, "objects": [], "next_after": "o1"}'))
     assert "'o1' repeats" in error_of(lambda: list(robot.objects())).detail
+    for after in (b"o1", b"o2", b"o1"):
+        ANSWERS.append((200, {}, b'{"generation": 7, "objects": [], "next_after": "%s"}' % after))
+    assert "'o1' repeats" in error_of(lambda: list(robot.objects())).detail
+    for odd in (b"null", b"[]", b"[null]", b"[5]", b"5", b'"x"', b"{}", b'[{"answers": 5}]'):
+        ANSWERS.append((200, {}, b'{"generation": 7, "scene": "s", "frame": "world", "unit": "m", "results": %s}' % odd))
+        assert error_of(lambda: robot.find("chair", near=(1, 2, 3))).status == 200, odd
+    for odd in (b"5", b'"x"', b"[]"):
+        ANSWERS.append((200, {}, b'{"from": 1, "to": %s, "frame": "world", "none": null}' % odd))
+        assert "belongs" in error_of(robot.changes).detail, odd
     ANSWERS.append((200, {}, b'{"generation": 7, "results": []}'))
     assert "lacks members" in error_of(lambda: robot.ask(texts=["chair"])).detail
     ANSWERS.append((200, {}, b'{"other": 1}'))

@@ -30,7 +30,18 @@ use crate::files;
 /// `images_dir`: by default `images/` beside COLMAP's `sparse/` (or beside or in the model's folder), the paths in a
 /// `transforms.json`, or ScanNet's `color/`. Images need not exist, except ScanNet's: only they tell their size.
 pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
+    let about = files::metadata(path)?;
+    let json = path.join("transforms.json");
     let not_found = || {
+        if !about.is_dir() && !about.is_file() {
+            return Err(PoseError::of(path, "it is neither a file nor a folder; copy the poses into one"));
+        }
+        if json.symlink_metadata().is_ok() {
+            return Err(PoseError::of(
+                &json,
+                "it is a folder, a pipe or a link to nothing; put a file there",
+            ));
+        }
         let train = path.join("transforms_train.json");
         let advice = match train.is_file() {
             true => format!("give {}", train.display()),
@@ -40,7 +51,7 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
                      transforms.json and no pose/";
         Err(PoseError::of(path, format_args!("{fault}; {advice}")))
     };
-    if files::metadata(path)?.is_file() {
+    if about.is_file() {
         return match path.extension().and_then(|e| e.to_str()) {
             Some("json") => transforms::read(path, images_dir),
             Some("bin") => colmap::read(paths::parent(path)?.as_path(), PoseSource::ColmapBinary, images_dir),
@@ -48,7 +59,6 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
             _ => not_found(),
         };
     }
-    let json = path.join("transforms.json");
     let other = |read: &Path, not: &Path| {
         format!("read {}; {} is ignored: name it to read it", read.display(), not.display())
     };

@@ -106,6 +106,8 @@ struct Sog {
     path: PathBuf,
     parts: Parts,
     len_bytes: u64,
+    /// Of the first image with a pixel for each Gaussian.
+    width: Option<usize>,
 }
 
 struct Pixels {
@@ -127,7 +129,7 @@ pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaus
     let folder = meta_path.parent().unwrap_or(Path::new("")).to_path_buf();
     let len_bytes = files::metadata(meta_path)?.len();
     let name = meta_path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let mut sog = Sog { path: meta_path.into(), parts: Parts::Folder(folder), len_bytes };
+    let mut sog = Sog { path: meta_path.into(), parts: Parts::Folder(folder), len_bytes, width: None };
     let meta = sog.meta(&name)?;
     for file in meta.files() {
         sog.len_bytes += files::metadata(&sog.path_in_folder(file)?)?.len();
@@ -144,7 +146,7 @@ pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians
         let format = "a ZIP file without the meta.json of SOG";
         return Err(SplatError::unsupported(path, format, "unpack it and give the splat inside"));
     }
-    let mut sog = Sog { path: path.into(), parts: Parts::Bundle(Box::new(archive)), len_bytes };
+    let mut sog = Sog { path: path.into(), parts: Parts::Bundle(Box::new(archive)), len_bytes, width: None };
     let meta = sog.meta("meta.json")?;
     sog.decode(&meta, options)
 }
@@ -200,6 +202,22 @@ impl Sog {
         let bytes = self.bytes(part, MAX_META_BYTES)?;
         let text = files::text_of(&bytes).map_err(|fault| SplatError::at(&self.path, part, fault))?;
         serde_json::from_str(text).map_err(|cause| self.undecodable(part, "the meta data", cause))
+    }
+
+    /// Returns an image with a pixel for each Gaussian; all of these have one size.
+    fn of_gaussians(
+        &mut self,
+        files: &[String],
+        index: usize,
+        n_pixels: RangeInclusive<u64>,
+    ) -> Result<Pixels, SplatError> {
+        let pixels = self.pixels(files, index, n_pixels)?;
+        let width = *self.width.get_or_insert(pixels.width);
+        if pixels.width != width {
+            let expected = format_args!("{width} pixels a row, as in the other images");
+            return Err(self.malformed(&files[index], expected, pixels.width));
+        }
+        Ok(pixels)
     }
 
     /// Returns the image at `index` of `files`; its number of pixels must lie in `n_pixels`.
@@ -273,7 +291,7 @@ impl Sog {
         self.decode_rotations(meta, n_pixels.clone(), &mut out, n)?;
 
         let tables: [_; 3] = self.tables("scales", &meta.scales)?;
-        let scales = self.pixels(&meta.scales.files, 0, n_pixels.clone())?;
+        let scales = self.of_gaussians(&meta.scales.files, 0, n_pixels.clone())?;
         out.scales.extend(
             scales
                 .iter(n)
@@ -282,7 +300,7 @@ impl Sog {
         drop(scales);
 
         let tables: [_; 3] = self.tables("sh0", &meta.sh0)?;
-        let sh0 = self.pixels(&meta.sh0.files, 0, n_pixels.clone())?;
+        let sh0 = self.of_gaussians(&meta.sh0.files, 0, n_pixels.clone())?;
         out.sh_dc.extend(sh0.iter(n).map(|codes| -> [f32; 3] {
             std::array::from_fn(|channel| tables[channel][usize::from(codes[channel])] as f32)
         }));
@@ -307,8 +325,8 @@ impl Sog {
         out: &mut Gaussians,
         n: usize,
     ) -> Result<(), SplatError> {
-        let low = self.pixels(&meta.means.files, 0, n_pixels.clone())?;
-        let high = self.pixels(&meta.means.files, 1, n_pixels)?;
+        let low = self.of_gaussians(&meta.means.files, 0, n_pixels.clone())?;
+        let high = self.of_gaussians(&meta.means.files, 1, n_pixels)?;
         out.means_in_world.extend(low.iter(n).zip(high.iter(n)).map(|(low, high)| {
             DVec3::from_array(std::array::from_fn(|axis| {
                 let unit = f64::from(u16::from_le_bytes([low[axis], high[axis]])) / 65535.0;
@@ -328,7 +346,7 @@ impl Sog {
         out: &mut Gaussians,
         n: usize,
     ) -> Result<(), SplatError> {
-        let quats = self.pixels(&meta.quats.files, 0, n_pixels)?;
+        let quats = self.of_gaussians(&meta.quats.files, 0, n_pixels)?;
         let behind = quats.rgba.as_chunks::<4>().0.get(n..).unwrap_or_default();
         // Padding pixels are all equal.
         if behind.iter().any(|pixel| *pixel != behind[0] && pixel[3] >= ROTATION_TAG) {
@@ -364,7 +382,7 @@ impl Sog {
         };
         let per_channel = Gaussians::sh_rest_per_channel(degree);
         let n_entries = codebook.rgba.len() / 4 / per_channel;
-        let labels = self.pixels(&sh_rest.files, 1, n_pixels)?;
+        let labels = self.of_gaussians(&sh_rest.files, 1, n_pixels)?;
         out.sh_degree = degree;
         out.sh_rest.reserve_exact(count * 3 * per_channel);
         for [low, high, ..] in labels.iter(count) {

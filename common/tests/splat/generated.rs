@@ -289,6 +289,10 @@ fn sog_labels_and_codebooks_out_of_range() {
     assert_eq!(read_all(path).unwrap_or_else(|e| panic!("{e}")).sh_degree, 1);
     write_webp(&path.join("labels.webp"), 3, &[[128, 0, 0, 255]; 6]);
     assert_error(read_all(path), &["shN: expected labels below 128, found 128"]);
+    // Resized images have their Gaussians at other places.
+    write_webp(&path.join("labels.webp"), 4, &[[127, 0, 0, 255]; 8]);
+    assert_error(read_all(path), &["labels.webp: expected 3 pixels a row, as in the other images, found 4"]);
+    write_webp(&path.join("labels.webp"), 3, &[[127, 0, 0, 255]; 6]);
 
     // Version 2 with a codebook null, 1, ... 255 (PlayCanvas takes 1 + (1 - 255) / 255 for null), and a short one.
     let numbers = |n: usize| (1..n).map(|i| i.to_string()).collect::<Vec<_>>().join(",");

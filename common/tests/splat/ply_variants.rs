@@ -301,6 +301,10 @@ fn files_of_other_kinds_are_read_or_named() {
     // A single scale holds for all axes.
     let ball: Vec<_> = geometry("float").into_iter().filter(|(_, name, _)| *name != "scale_1").collect();
     assert_eq!(read_back(&[&ball[..], &colours].concat()).scales[0], [1.0; 3]);
+    // Mip-Splatting's, by hand: 1 and 0.75 make 1.25, and 0.5 / 1.25^3 is 0.256.
+    let blurred = [&ball[..], &colours, &[("float", "filter_3D", 0.75)]].concat();
+    let blurred = read_back(&blurred);
+    assert_eq!((blurred.scales[0], blurred.opacities[0]), ([1.25; 3], 0.256));
     let rest: Vec<String> = (0..72).map(|i| format!("f_rest_{i}")).collect();
     let mut fourth = [&geometry("float")[..], &[("float", "scale_2", 0.0)]].concat();
     fourth.extend((0..3).map(|i| ("float", ["f_dc_0", "f_dc_1", "f_dc_2"][i], 0.25)));

@@ -60,17 +60,20 @@ pub fn things(stamp: Stamp<'_>, text: &str, answers: &[Answer]) -> Value {
     json!({"deletions": [], "entities": answers.iter().map(entity).collect::<Vec<_>>()})
 }
 
-/// Returns a `foxglove.PointCloud` of Gaussians: x, y, z and score of each as little-endian f32.
+/// Returns a `foxglove.PointCloud` of Gaussians: x, y, z and score of each as little-endian f32, from the first one's
+/// place, as 32 bits do not hold UTM's coordinates.
 pub fn points(stamp: Stamp<'_>, answers: &[PointAnswer]) -> Value {
+    let origin = answers.first().map_or([0.0; 3], |first| first.position_in_world);
     let numbers = answers.iter().flat_map(|answer| {
-        let [x, y, z] = answer.position_in_world.map(|metres| metres as f32);
+        let at = answer.position_in_world;
+        let [x, y, z] = [0, 1, 2].map(|axis| (at[axis] - origin[axis]) as f32);
         [x, y, z, answer.score]
     });
     let data: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
     let field = |(name, offset): (&str, u32)| json!({"name": name, "offset": offset, "type": FLOAT32});
     let fields = [("x", 0), ("y", 4), ("z", 8), ("score", 12)].map(field);
     json!({
-        "timestamp": stamp.time(), "frame_id": stamp.frame, "pose": pose([0.0; 3], [0.0, 0.0, 0.0, 1.0]), "point_stride": 16,
+        "timestamp": stamp.time(), "frame_id": stamp.frame, "pose": pose(origin, [0.0, 0.0, 0.0, 1.0]), "point_stride": 16,
         "fields": fields, "data": BASE64.encode(data),
     })
 }

@@ -126,7 +126,12 @@ impl Robot {
             return Err(RobotError::Refused(format!("{id:?} is no id of a thing; {advice}")));
         }
         let path = format!("/v1/objects/{id}/thumbnail");
-        self.read_bytes(&path, self.agent.get(self.address(&path)).call())
+        let body = self.read_bytes(&path, self.agent.get(self.address(&path)).call())?;
+        if !body.starts_with(&[0xff, 0xd8]) {
+            let advice = "does --robot name a slag-edge of this version?";
+            return Err(RobotError::Refused(format!("the picture of {id} is no JPEG file; {advice}")));
+        }
+        Ok(body)
     }
 
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<GoalReply, RobotError> {

@@ -151,7 +151,7 @@ impl Mistake {
             Self::UpsideDown,
         ];
         let focals = FOCAL_SCALES.map(Self::FocalScale);
-        let scales = [0.01, 0.1, 10.0, 100.0].map(Self::SceneScale);
+        let scales = [0.001, 0.01, 0.1, 10.0, 100.0, 1000.0].map(Self::SceneScale);
         let axes = right_angles().into_iter().map(Self::WorldAxes);
         let mirrored = (0..3).map(Self::Mirrored);
         cameras.into_iter().chain(focals).chain(scales).chain(axes).chain(mirrored).collect()

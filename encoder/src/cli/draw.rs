@@ -12,12 +12,12 @@ use slag_common::{Gaussians, View, poses};
 
 use super::common::{self, Exit, folder_of, print};
 use super::memory::default_memory_bytes;
-use crate::ingest;
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::raster::{RasterView, Rasterizer, check_near_plane};
 use crate::viewpoints::{self, DEFAULT_N_VIEWS, DrawnView, ViewpointSettings};
+use crate::{check, ingest};
 
 const PLAN_EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder plan --scene scene.ply --out views/\n\
@@ -93,6 +93,7 @@ impl DrawingArgs {
         viewpoints::check_folder(&self.out)?;
         let mut scene = splat::read(&self.scene, &ReadOptions { with_sh_rest: true })?;
         ingest::drop_broken_harmonics(&mut scene);
+        check::suspicions(&scene, &[]).iter().for_each(|found| tracing::warn!("{}", found.text));
         let name = self.scene.file_name().unwrap_or_default().to_string_lossy().into_owned();
         Ok((scene, Devices::open(&self.device, GpuOptions::default())?, name))
     }

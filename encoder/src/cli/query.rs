@@ -56,6 +56,9 @@ pub struct QueryArgs {
     pub scene: Option<PathBuf>,
 }
 
+/// Positions by which a splat is known to be the store's.
+const N_COMPARED: usize = 64;
+
 pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let outputs = args.scores.iter().chain(&args.ply).map(PathBuf::as_path);
     let read: Vec<&Path> = args.scene.iter().chain(&args.models.models).map(PathBuf::as_path).collect();
@@ -84,7 +87,8 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let scene = match &args.scene {
         Some(path) => {
             let scene = splat::read(path, &ReadOptions { with_sh_rest: true })?;
-            query::check_scene(&reader, &scene, &hits).with_context(|| path.display().to_string())?;
+            let compared = query::located(&reader, &scores, &scores.best(N_COMPARED))?;
+            query::check_scene(&reader, &scene, &compared).with_context(|| path.display().to_string())?;
             Some(scene)
         }
         None => None,

@@ -266,7 +266,7 @@ fn of_the_same_stem(path: &Path) -> Option<PathBuf> {
 }
 
 /// Version of plan and drawings; a change redraws them.
-const PLAN_VERSION: u32 = 5;
+const PLAN_VERSION: u32 = 6;
 
 /// Draws a splat's planned views beside the poses file, unless they are there.
 pub(super) fn make(

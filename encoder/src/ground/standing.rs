@@ -44,6 +44,8 @@ struct Things {
     ground: Ground,
     /// World units: median size of a Gaussian.
     resolution: f64,
+    /// Voxel, from the origin, that is the middle of those numbered: scenes may lie far from the origin (UTM).
+    middle: DVec3,
     /// Ascending.
     voxels: Vec<u64>,
     of_voxel: Vec<u32>,
@@ -160,8 +162,10 @@ impl Things {
         let area = |i: usize| axes(i)[0] * axes(i)[1] * f64::from(scene.opacities[i]);
         let points: Vec<(DVec3, f64)> = sample().filter(is_fine).map(|i| (upright(i), area(i))).collect();
         let ground = Ground::find(&points, resolution)?;
+        let along = |axis: usize| median(&mut points.iter().map(|(at, _)| at[axis]).collect::<Vec<f64>>());
+        let middle = (DVec3::new(along(0)?, along(1)?, along(2)?) / (VOXEL * resolution)).floor();
         let (voxels, of_voxel, is_narrow) = (Vec::new(), Vec::new(), Vec::new());
-        let mut things = Self { upright_from_world, ground, resolution, voxels, of_voxel, is_narrow };
+        let mut things = Self { upright_from_world, ground, resolution, middle, voxels, of_voxel, is_narrow };
         let solid = (0..scene.len()).into_par_iter().filter(|i| is_surface(i) && is_fine(i));
         let touched = |i: usize| {
             let (things, mean) = (&things, scene.means_in_world[i]);
@@ -185,7 +189,7 @@ impl Things {
     /// Like `voxel_of`, but on and below the ground, too.
     fn place_of(&self, point: DVec3) -> Option<u64> {
         let half = f64::from(1_u32 << (BITS - 1));
-        let at = (point / (VOXEL * self.resolution)).floor() + half;
+        let at = (point / (VOXEL * self.resolution)).floor() - self.middle + half;
         let is_within = at.min_element() >= 1.0 && at.max_element() < 2.0 * half - 1.0;
         is_within.then(|| at.to_array().into_iter().fold(0, |key, at| key << BITS | at as u64))
     }
@@ -294,9 +298,15 @@ mod tests {
         let mut scene = Gaussians::balls(means, 0.1);
         scene.scales.fill([0.1, 0.1, 0.01]);
         scene.opacities.fill(0.9);
+        // A voxel has 0.4 m. UTM's northings reach 10,000 km.
+        let utm = DVec3::new(4e5, 8e6, 0.0);
+        scene.means_in_world.iter_mut().for_each(|mean| *mean += utm);
         let standing = Standing(Things::find(&scene, DVec3::Z));
         let is_bare = |x: f64, width: f64, z: f64| {
-            let is_part = |mean: &DVec3| (x..x + width).contains(&mean.x) && mean.y < 2.0 && mean.z == z;
+            let is_part = |mean: &DVec3| {
+                let at = *mean - utm;
+                (x..x + width).contains(&at.x) && at.y < 2.0 && at.z == z
+            };
             let part_of: Vec<u32> =
                 scene.means_in_world.iter().map(|mean| u32::from(!is_part(mean))).collect();
             standing.is_bare_ground(&standing.footprints(&scene, &part_of, 1)[0])

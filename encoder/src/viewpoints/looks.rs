@@ -24,8 +24,10 @@ const NEAR: f64 = 0.035 * WIDTH;
 const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
 /// Least weight of a seen Gaussian, pixels of the drawing: 36 px of a photo 800 px wide.
 const MIN_WEIGHT: f32 = 0.09;
-/// Sides from which a Gaussian can be seen, around the vertical.
-const N_SIDES: usize = 8;
+/// Sides from which a Gaussian can be seen, around the vertical; as many again from steeply above.
+const N_SIDES: u8 = 8;
+/// Sine of the elevation from which a camera is steeply above: 37 degrees.
+const STEEP: f64 = 0.6;
 /// Bytes of a look: eight per Gaussian, about three Gaussians per pixel.
 pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
 
@@ -132,8 +134,9 @@ fn count_pixels(layers: &[(f64, &[RegionWeight])], sums: &[(f64, f64)], near: f6
 
 /// Side from which a Gaussian is seen, by the direction to the camera.
 fn side(towards: DVec3) -> u8 {
-    let turns = towards.y.atan2(towards.x) / std::f64::consts::TAU + 0.5;
-    ((turns * N_SIDES as f64) as u8).min(N_SIDES as u8 - 1)
+    let turns = towards.y.atan2(towards.x) / TAU + 0.5;
+    let around = ((turns * f64::from(N_SIDES)) as u8).min(N_SIDES - 1);
+    if towards.z > STEEP * towards.length() { N_SIDES + around } else { around }
 }
 
 /// Most candidates; each costs a small drawing.
@@ -146,7 +149,7 @@ const CLEARANCE: f64 = 0.12;
 /// Least height of a storey, as a share of the house's.
 const MIN_STOREY: f64 = 0.2;
 /// Heights of cameras above the ground, as shares of the scene's width, and how far they look down, radians.
-const OUTDOOR: [(f64, f64); 3] = [(0.03, 0.05), (0.06, 0.15), (0.12, 0.4)];
+const OUTDOOR: [(f64, f64); 4] = [(0.03, 0.05), (0.06, 0.15), (0.12, 0.4), (0.25, 0.8)];
 /// Rings around an object: elevation, radians, and distance as a share of the one at which it fills the image.
 const RINGS: [(f64, f64); 5] = [(0.1, 1.0), (0.1, 0.6), (0.45, 1.0), (0.45, 0.6), (0.95, 1.0)];
 const N_AROUND: usize = 24;

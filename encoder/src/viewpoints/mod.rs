@@ -198,7 +198,8 @@ fn large_from_above(space: &Space, rasterizer: &dyn Rasterizer) -> Result<bool, 
 #[derive(Clone, Copy, Default)]
 struct Seen {
     n_views: u8,
-    sides: u8,
+    /// A bit for each.
+    sides: u16,
 }
 
 impl Seen {

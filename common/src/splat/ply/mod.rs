@@ -36,6 +36,8 @@ const BRIGHTEST: f32 = 16.0;
 const SECOND_SCALE: &str = "scale_1";
 /// Flat Gaussians of 2DGS lack the third.
 const THIRD_SCALE: &str = "scale_2";
+/// Standard deviation of the blur by which Mip-Splatting draws a Gaussian; its fused exports lack it.
+const BLUR: &str = "filter_3D";
 
 pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let ply = Ply::open(input)?;
@@ -67,6 +69,8 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
         Some(rgb) => wanted.extend(rgb),
         None => wanted.extend(ply.properties(vertex, "f_dc_0 f_dc_1 f_dc_2", NOT_A_SPLAT)?),
     }
+    let blur = ply.elements[vertex].property(BLUR);
+    wanted.push(blur.unwrap_or(wanted[8]));
     let (degree, rest) = sh_rest_properties(&ply, vertex)?;
     let degree = options.kept_degree(degree);
     if degree > 0 {
@@ -78,14 +82,19 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
     ply.seek_element(vertex)?;
     let mut out = columns(ply.checked_count(vertex)?, degree);
     ply.rows(&wanted, |row| {
-        let [x, y, z, w, i, j, k, logit, s0, s1, s2, r, g, b, rest @ ..] = row else {
-            unreachable!("every row has the 14 values requested");
+        let [x, y, z, w, i, j, k, logit, s0, s1, s2, r, g, b, f, rest @ ..] = row else {
+            unreachable!("every row has the 15 values requested");
         };
         out.means_in_world.push(DVec3::new(*x, *y, *z));
         out.rotations_wxyz.push(unit_rotation([*w, *i, *j, *k]));
-        let [s0, s1, s2] = [s0, s1, s2].map(|s| s.exp() as f32);
+        let sharp = [s0, s1, s2].map(|s| s.exp());
+        // Yu et al. 2024, equation 9: the integral of the Gaussian stays.
+        let drawn = sharp.map(|s| if blur.is_some() { s.hypot(*f) } else { s });
+        let dimmed: f64 = if blur.is_some() { (0..3).map(|i| sharp[i] / drawn[i]).product() } else { 1.0 };
+        let [s0, s1, s2] = drawn.map(|s| s as f32);
         out.scales.push([s0, s1, if is_ball || third_scale.is_some() { s2 } else { 0.0 }]);
-        out.opacities.push(opaque.map_or_else(|| sigmoid(*logit), |opaque| (logit / opaque) as f32));
+        let opacity = opaque.map_or_else(|| sigmoid(*logit), |opaque| (logit / opaque) as f32);
+        out.opacities.push((f64::from(opacity) * dimmed) as f32);
         out.sh_dc.push([r, g, b].map(|c| *c as f32));
         out.sh_rest.extend(rest.iter().map(|c| *c as f32));
     })?;

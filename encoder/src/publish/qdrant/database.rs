@@ -161,6 +161,8 @@ pub(super) struct Collection<'a> {
     pub(super) database: &'a Database<'a>,
     pub(super) name: String,
     pub(super) manifest: &'a Manifest,
+    /// As its points name it.
+    pub(super) store: String,
 }
 
 impl Collection<'_> {
@@ -174,10 +176,7 @@ impl Collection<'_> {
         self.check_vectors(&info)?;
         match self.count_others().await? {
             0 => Ok(Some(info)),
-            n_points => {
-                let scene = self.manifest.scene.clone();
-                Err(PushError::OtherScene { collection: self.name.clone(), scene, n_points })
-            }
+            n_points => Err(PushError::OtherStore { collection: self.name.clone(), n_points }),
         }
     }
 
@@ -227,8 +226,9 @@ impl Collection<'_> {
         existing: &HashMap<String, PayloadSchemaInfo>,
     ) -> Result<(), PushError> {
         let place = self.manifest.geo_reference.map(|_| ("location", FieldType::Geo));
-        let fields = [("scene", FieldType::Keyword), ("generation", FieldType::Integer)];
-        let missing = fields.into_iter().chain(place).filter(|(field, _)| !existing.contains_key(*field));
+        let names = ["scene", "store"].map(|field| (field, FieldType::Keyword));
+        let fields = names.into_iter().chain([("generation", FieldType::Integer)]);
+        let missing = fields.chain(place).filter(|(field, _)| !existing.contains_key(*field));
         for (field, kind) in missing {
             let index = || {
                 let request = CreateFieldIndexCollectionBuilder::new(&self.name, field, kind).wait(true);
@@ -255,7 +255,7 @@ impl Collection<'_> {
     }
 
     pub(super) async fn count_others(&self) -> Result<u64, PushError> {
-        self.count(Filter::must_not([Condition::matches("scene", self.manifest.scene.clone())])).await
+        self.count(Filter::must_not([Condition::matches("store", self.store.clone())])).await
     }
 
     pub(super) async fn count(&self, filter: Filter) -> Result<u64, PushError> {
@@ -296,17 +296,19 @@ pub(super) fn points(
     shard: &ShardView<'_>,
     range: std::ops::Range<usize>,
     manifest: &Manifest,
+    store: &str,
 ) -> Vec<PointStruct> {
     let Some(exact) = &shard.exact else { return Vec::new() };
     let dim = shard.header.dim as usize;
     let point = |i: usize| {
         let mean = shard.position_in_world(i);
-        let mut payload = Payload::with_capacity(7);
+        let mut payload = Payload::with_capacity(8);
         for (axis, value) in [("x", mean.x), ("y", mean.y), ("z", mean.z)] {
             payload.insert(axis, value);
         }
         payload.insert("cell_id", i64::from(shard.header.cell_id));
         payload.insert("scene", manifest.scene.clone());
+        payload.insert("store", store);
         payload.insert("generation", generation(manifest));
         if let Some(place) = manifest.geo_reference.map(|place| place.geographic_from_world(mean)) {
             payload.insert("location", GeoPoint { lon: place.longitude_deg, lat: place.latitude_deg });

@@ -110,9 +110,10 @@ pub(crate) enum PushError {
     )]
     Collection { collection: String, found: String, expected: String },
     #[error(
-        "collection {collection:?} holds {n_points} points of other scenes than {scene:?}, and ids would collide; choose another collection"
+        "collection {collection:?} holds {n_points} points of another store, and ids would collide; choose another \
+         collection, or delete this one"
     )]
-    OtherScene { collection: String, scene: String, n_points: u64 },
+    OtherStore { collection: String, n_points: u64 },
     #[error(
         "{url}: {action}: {cause}; does Qdrant run there, and is this its gRPC port (6334 by default; 6333 is REST's)? Check the key and the database's log, then run the push again: it continues"
     )]

@@ -23,7 +23,8 @@ pub(crate) async fn push(
 ) -> Result<PushReport, PushError> {
     let database = Database::new(options)?;
     let records = Records { tree: records.open_tree("push")?, url: options.url.trim_end_matches('/') };
-    let push = Push { database: &database, reader, records, options, report: PushReport::default() };
+    let store = records.store(reader.current().hash).await?;
+    let push = Push { database: &database, reader, records, store, options, report: PushReport::default() };
     tokio::select! {
         biased;
         () = cancel => Err(PushError::Cancelled),
@@ -49,6 +50,15 @@ struct Records<'a> {
 impl Records<'_> {
     fn key(&self, collection: &str) -> String {
         format!("{}\n{collection}", self.url)
+    }
+
+    /// What points name as their store: its first manifest that was pushed. Scenes of two stores may have one name.
+    async fn store(&self, manifest: Hash32) -> Result<String, PushError> {
+        let new = manifest.to_string();
+        let known = self.tree.compare_and_swap("store", None::<&str>, Some(new.as_str()))?;
+        self.tree.flush_async().await?;
+        let known = known.err().and_then(|other| other.current);
+        Ok(known.map_or(new, |known| String::from_utf8_lossy(&known).into_owned()))
     }
 
     fn read(&self, collection: &str) -> Result<Option<Record>, PushError> {
@@ -100,6 +110,7 @@ struct Push<'a> {
     database: &'a Database<'a>,
     reader: &'a StoreReader,
     records: Records<'a>,
+    store: String,
     options: &'a PushOptions,
     report: PushReport,
 }
@@ -136,7 +147,12 @@ impl<'a> Push<'a> {
     }
 
     fn collection(&self, name: String) -> Collection<'a> {
-        Collection { database: self.database, name, manifest: self.reader.manifest() }
+        Collection {
+            database: self.database,
+            name,
+            manifest: self.reader.manifest(),
+            store: self.store.clone(),
+        }
     }
 
     async fn push_target(
@@ -157,7 +173,7 @@ impl<'a> Push<'a> {
             while record.n_points_in_cell < n_points {
                 let start = record.n_points_in_cell;
                 let end = n_points.min(start.saturating_add(self.options.n_points_per_batch.get()));
-                collection.upsert(points(&shard, start..end, manifest)).await?;
+                collection.upsert(points(&shard, start..end, manifest, &self.store)).await?;
                 record.n_points_in_cell = end;
                 record.n_points += (end - start) as u64;
                 self.report.n_sent += (end - start) as u64;
@@ -201,7 +217,7 @@ impl<'a> Push<'a> {
         Ok(record)
     }
 
-    /// Deletes collections of cells that the scene no longer has, except those with other scenes' points and those that
+    /// Deletes collections of cells that the scene no longer has, except those with other stores' points and those that
     /// no push from this store made.
     async fn remove_obsolete(&mut self, targets: &[Target<'a>]) -> Result<(), PushError> {
         let mut names = self.database.collection_names().await?;

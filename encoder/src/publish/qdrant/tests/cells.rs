@@ -13,10 +13,11 @@ fn vectors() -> qdrant_client::qdrant::VectorParams {
     VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build()
 }
 
+/// A point of this scene, which another store has, too.
 pub(super) fn held_of(scene: &str) -> Held {
     let mut held = Held::new(vectors());
-    held.points
-        .insert(7, Stored { vector: vec![1.0; DIM], payload: [("scene".to_owned(), scene.into())].into() });
+    let payload = [("scene", scene), ("store", "another")].map(|(key, value)| (key.to_owned(), value.into()));
+    held.points.insert(7, Stored { vector: vec![1.0; DIM], payload: payload.into() });
     held
 }
 
@@ -35,7 +36,7 @@ impl Fixture {
             let of_cell = self.truth.iter().filter(|(_, (_, _, cell))| *cell as usize == cell_id);
             let expected: Vec<&u64> = of_cell.map(|(id, _)| id).collect();
             assert_eq!(held.points.keys().collect::<Vec<_>>(), expected, "{name}");
-            assert_eq!(held.indexed, ["scene", "generation", "location"], "{name}");
+            assert_eq!(held.indexed, ["scene", "store", "generation", "location"], "{name}");
             all.extend(held.points.clone());
         }
         self.assert_points(&all, generation);
@@ -141,7 +142,7 @@ async fn foreign_cells_are_refused_before_anything_is_written() {
     let (fixture, server, url) = started().await;
     server.with(|state| state.collections.insert(NAMES[2].into(), held_of("attic")));
     let refused = fixture.push(&cells(&url)).await.expect_err("another scene");
-    let PushError::OtherScene { collection, n_points: 1, .. } = &refused else { panic!("{refused}") };
+    let PushError::OtherStore { collection, n_points: 1, .. } = &refused else { panic!("{refused}") };
     assert_eq!(collection, NAMES[2]);
     assert_eq!(names(&server), [NAMES[2]]);
     let mut held = Held::new(vectors());

@@ -232,7 +232,7 @@ async fn every_point_arrives() {
     assert_eq!(seen.last(), Some(&PushProgress { n_points: N_POINTS, n_points_expected: N_POINTS }));
     fixture.assert_arrived(&server, 1);
     let found = server.with(|state| state.collections["yard"].indexed.clone());
-    assert_eq!(found, ["scene", "generation", "location"]);
+    assert_eq!(found, ["scene", "store", "generation", "location"]);
 }
 
 /// The client itself repeats once, so it takes three failures in a row to need our repetition.
@@ -297,17 +297,17 @@ async fn a_push_that_is_cut_off_continues() {
 #[tokio::test]
 async fn missing_payload_indexes_are_made_by_the_next_push() {
     let fixture = fixture();
-    for n_before in 0..3 {
+    for n_before in 0..4 {
         let (server, url) = Server::start(None).await;
         server.with(|state| state.n_indexes_refused = 1);
         let refused = fixture.push(&options(&url)).await.expect_err("no index");
         assert!(matches!(refused, PushError::Database { action: "index a payload field", .. }), "{refused}");
-        let made = ["scene", "generation", "location"][..n_before].iter().map(ToString::to_string);
+        let made = ["scene", "store", "generation", "location"][..n_before].iter().map(ToString::to_string);
         server.with(|state| state.collections.get_mut("yard").expect("created").indexed = made.collect());
         let report = fixture.push(&options(&url)).await.expect("continues");
         assert_eq!((report.n_points, report.n_created_collections), (N_POINTS, 0));
         let indexed = server.with(|state| state.collections["yard"].indexed.clone());
-        assert_eq!(indexed, ["scene", "generation", "location"], "{n_before} were there");
+        assert_eq!(indexed, ["scene", "store", "generation", "location"], "{n_before} were there");
     }
 }
 
@@ -345,9 +345,11 @@ async fn collections_that_do_not_fit_are_refused() {
         );
         assert_eq!(refused, expected);
     }
-    server.with(|state| state.collections.insert("yard".into(), cells::held_of("attic")));
-    let refused = fixture.push(&options(&url)).await.expect_err("another scene");
-    assert!(matches!(refused, PushError::OtherScene { n_points: 1, .. }), "{refused}");
+    for scene in ["attic", "yard"] {
+        server.with(|state| state.collections.insert("yard".into(), cells::held_of(scene)));
+        let refused = fixture.push(&options(&url)).await.expect_err("another store");
+        assert!(matches!(refused, PushError::OtherStore { n_points: 1, .. }), "{refused}");
+    }
     let found = server.with(|state| (state.collections["yard"].points.len(), state.acknowledged.len()));
     assert_eq!(found, (1, 0), "untouched");
 }
