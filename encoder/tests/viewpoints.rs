@@ -217,6 +217,9 @@ fn a_thing_by_itself_is_seen_from_around() {
 #[test]
 fn splats_that_tell_too_little_are_refused() {
     let refused = |scene: &Gaussians, up| plan_of(scene, up).expect_err("refused").to_string();
+    let mut point = room();
+    point.means_in_world.fill(DVec3::new(1.0, 2.0, 3.0));
+    assert!(refused(&point, None).contains("all Gaussians lie at [1, 2, 3]"), "{}", refused(&point, None));
     let message = refused(&Gaussians::default(), None);
     assert!(message.contains("--views"), "{message}");
     let mut random = Random::new(7);

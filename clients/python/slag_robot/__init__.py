@@ -217,9 +217,11 @@ def _read(kind: Any, value: Any) -> Any:
         return value
     if get_origin(kind) is Union:
         return _read(parts[0], value)
+    if not is_dataclass(parts[0]):
+        return value
     if not isinstance(value, list):
         raise _wrong(value, "a list")
-    return tuple(_read(parts[0], one) for one in value) if is_dataclass(parts[0]) else value
+    return tuple(_read(parts[0], one) for one in value)
 
 
 def _wrong(value: Any, expected: str) -> SlagError:

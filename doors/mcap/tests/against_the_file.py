@@ -60,7 +60,9 @@ def main():
     points = list(struct.iter_unpack("<4f", base64.b64decode(said["data"])))
     truth = get(f"{robot}/v1/query?text=red&kind=gaussians&limit=50")["results"][0]["answers"]
     assert truth and len(points) == len(truth), (len(points), len(truth))
+    origin = xyz(said["pose"]["position"])
     for point, answer in zip(points, truth):
+        point = [a + b for a, b in zip(point, [*origin, 0.0])]
         assert near(point, [*answer["position_in_world"], answer["score"]], 1e-5), (point, answer)
 
     name, said, _ = found["/slag/ground"]

@@ -54,6 +54,11 @@ pub(super) fn thinned(
              with --views"
         )));
     }
+    let first = thin.means_in_world[solid[0] as usize];
+    if solid.iter().all(|i| thin.means_in_world[*i as usize] == first) {
+        let why = format!("no views can be planned: all Gaussians lie at {first}; export the splat again");
+        return Err(ViewpointError::Refused(why));
+    }
     Ok((thin, solid))
 }
 

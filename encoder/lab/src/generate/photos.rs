@@ -13,8 +13,6 @@ use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
 
 const N_PHOTOS: u32 = 4;
-/// Photographed from the ground, in turn.
-const KINDS: [SceneKind; 4] = [SceneKind::Room, SceneKind::Yard, SceneKind::Street, SceneKind::Warehouse];
 
 /// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`), `things.npy` (u16
 /// `[n][height][width]`: the thing's number, 65535 for the sky) and `depths.npy` (f32 `[n][height][width]`: metres
@@ -32,7 +30,7 @@ pub fn write(
     let of_seed = |seed: u64| {
         let layout = match are_aerial {
             true => Layout::new(&[SceneKind::Yard, SceneKind::Street], seed, &|_, _| true),
-            false => Layout::new(&[KINDS[seed as usize % KINDS.len()]], seed, &|_, _| true),
+            false => Layout::of_any_kind(seed, &|_, _| true),
         };
         let solids = layout.solids();
         let start = Xorshift::new(seed ^ 0xf070).between(0.0, 1.0);
