@@ -57,8 +57,9 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
     let of_mistake = |mistake: Mistake| Suspicion { text: mistake.to_string(), mistake: Some(mistake) };
     let mut found: Vec<Suspicion> = undrawable(scene, &usable).into_iter().map(of_text).collect();
     found.extend(activated(scene, &usable).map(of_mistake));
-    let texts = misread(scene, &usable).into_iter().chain(rounded(scene, &usable));
-    found.extend(texts.chain(doubled(scene, &usable)).map(of_text));
+    found.extend(misread(scene, &usable).into_iter().map(of_text));
+    // Rounding, too, brings Gaussians to one place.
+    found.extend(rounded(scene, &usable).or_else(|| doubled(scene, &usable)).map(of_text));
     found.extend(shifted(scene, views).map(|frame| {
         let [x, y, z] = frame.splat_from_poses.translation.to_array();
         let text = format!(
