@@ -188,3 +188,29 @@ fn photos_are_added_and_withdrawn() {
     assert!(lost["reason"].as_str().expect("text").contains("no view is taken"), "{lost}");
     assert_eq!(summary()["lost_views"], Value::Null);
 }
+
+/// A view far from the scene shows nothing of it, and names may be as long as the disk takes.
+#[test]
+fn drawings_that_show_nothing_are_told() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let room = generated(&VIEWS);
+    let poses = dir.path().join("transforms.json");
+    let draw = |is_seen: bool| {
+        let mut json = read_json(&room.join("transforms.json"));
+        let frames = json["frames"].as_array_mut().expect("frames");
+        frames.truncate(2);
+        frames[0]["file_path"] = format!("{}.png", "a".repeat(250)).into();
+        for frame in &mut frames[usize::from(is_seen)..] {
+            frame["transform_matrix"][0][3] = 9e3.into();
+        }
+        fs_err::write(&poses, json.to_string()).expect("written");
+        let mut draw = encoder(&["draw", "-q", "--depth", "--scene", text(&room.join("scene.ply"))]);
+        draw.args(["--views", text(&poses), "--out", text(&dir.path().join("drawn"))]).output().expect("runs")
+    };
+    let [some, none] = [draw(true), draw(false)];
+    let said = String::from_utf8_lossy(&some.stderr);
+    assert!(some.status.code() == Some(3) && said.contains("1 of 2 views show nothing"), "{said}");
+    let said = String::from_utf8_lossy(&none.stderr);
+    assert!(none.status.code() == Some(1) && said.contains("none of the 2 views shows anything"), "{said}");
+    assert_eq!(files_below(&dir.path().join("drawn/depth")).len(), 2);
+}

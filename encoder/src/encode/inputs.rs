@@ -1,6 +1,7 @@
 //! Scene, views and geo-reference as they were read, and the hash that tells two encodes apart.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -224,24 +225,28 @@ fn find_views(
 ) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
     let n_views = views.len();
     let (found, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| v.image_path.is_file());
-    let mut advice = "give the photos' folder with --images".to_owned();
-    if let Some(first) = gone.first() {
-        if let Some(other) = of_the_same_stem(&first.image_path) {
-            advice = format!(
+    let mut photos_of: BTreeMap<PathBuf, BTreeMap<OsString, PathBuf>> = BTreeMap::new();
+    let mut reason_of = |path: &Path| {
+        let folder = path.parent().unwrap_or(path);
+        let photos = photos_of.entry(folder.to_owned()).or_insert_with(|| photos_by_stem(folder));
+        let advice = match photos.get(path.file_stem().unwrap_or_default()) {
+            None => "give the photos' folder with --images".to_owned(),
+            Some(other) => format!(
                 "{} is there: the poses must name photos as they are, and JPEG, PNG and WebP are read",
                 other.display()
-            );
-        }
-        if settings.run.strict {
-            return Err(EncodeError::Failed(format!(
-                "{} of {n_views} photos are missing, the first is {}; {advice}",
-                gone.len(),
-                first.image_path.display()
-            )));
-        }
+            ),
+        };
+        format!("{}: no such photo; {advice}", path.display())
+    };
+    if let Some(first) = gone.first().filter(|_| settings.run.strict) {
+        let n = gone.len();
+        let reason = reason_of(&first.image_path);
+        return Err(EncodeError::Failed(format!(
+            "{n} of {n_views} photos are missing, the first is {reason}"
+        )));
     }
     let skip = |View { name: view, image_path, .. }: View| {
-        let reason = format!("{}: no such photo; {advice}", image_path.display());
+        let reason = reason_of(&image_path);
         SkippedView { view, reason }
     };
     let skipped: Vec<SkippedView> = gone.into_iter().map(skip).collect();
@@ -255,14 +260,16 @@ fn find_views(
 /// Endings of photos that other programs read, too.
 const PHOTO_ENDINGS: &str = "heic heif avif tif tiff dng bmp gif jxl jp2 jpg jpeg png webp";
 
-/// A photo of this name with another ending.
-fn of_the_same_stem(path: &Path) -> Option<PathBuf> {
-    let is_photo = |other: &PathBuf| {
-        let ending = other.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        other.file_stem() == path.file_stem() && PHOTO_ENDINGS.split(' ').any(|of| of == ending)
+/// Photos of a folder by their names without endings; of several endings, the first.
+fn photos_by_stem(folder: &Path) -> BTreeMap<OsString, PathBuf> {
+    let is_photo = |path: &PathBuf| {
+        let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        PHOTO_ENDINGS.split(' ').any(|of| of == ending)
     };
-    let files = fs_err::read_dir(path.parent()?).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
-    files.filter(is_photo).min()
+    let files = fs_err::read_dir(folder).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path()));
+    let mut photos: Vec<PathBuf> = files.filter(is_photo).collect();
+    photos.sort_unstable_by(|a, b| b.cmp(a));
+    photos.into_iter().map(|path| (path.file_stem().unwrap_or_default().to_owned(), path)).collect()
 }
 
 /// Version of plan and drawings; a change redraws them.
@@ -461,11 +468,10 @@ mod tests {
     #[test]
     fn a_photo_of_another_ending_is_found_and_no_other_file() {
         let folder = tempfile::tempdir().expect("a folder");
-        for name in ["a.HEIC", "a.json", "b.txt"] {
+        for name in ["a.HEIC", "a.json", "a.tif", "b.txt"] {
             fs_err::write(folder.path().join(name), "").expect("writes");
         }
-        let [a, b] = ["a.jpg", "b.jpg"].map(|name| of_the_same_stem(&folder.path().join(name)));
-        assert_eq!((a, b), (Some(folder.path().join("a.HEIC")), None));
+        assert_eq!(photos_by_stem(folder.path()), [("a".into(), folder.path().join("a.HEIC"))].into());
     }
 
     /// By hand: a camera with a photo of 400 x 300 px, absent, and two of 40 x 30 by their headers. Two are in work, 19

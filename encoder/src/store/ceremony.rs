@@ -100,7 +100,8 @@ impl Metadata {
             roles::promote(&self.store, role, &root.body)?;
         }
         let is_changed = |role: &str| root.body.roles[role] != present.body.roles[role];
-        if roles::ONLINE.into_iter().any(is_changed)
+        // A change that was cut off leaves what the present root's keys did not sign.
+        if (roles::ONLINE.into_iter().any(is_changed) || self.is_unfollowed()?)
             && let Some(targets) = self.targets(&present.body)?
         {
             self.sign_all(&targets, now_unix_secs)?;
@@ -151,6 +152,14 @@ impl Metadata {
 impl MetadataReader {
     pub(crate) fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
         let (root, bytes) = self.newest_root()?.ok_or_else(|| self.no_root())?;
+        if self.is_unfollowed()? {
+            tracing::warn!(
+                "robots refuse the store: the keys of root {} did not sign it, as where a change of keys was cut off; run \
+                 `slag-encoder store refresh --store {}`",
+                root.head.version,
+                self.store.display()
+            );
+        }
         let warn = |error: StoreError| {
             tracing::warn!("{error}");
             Ok(())

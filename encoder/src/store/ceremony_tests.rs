@@ -39,6 +39,31 @@ fn robots_follow_every_change_of_keys() {
     follow(&mut sleeper, dir.path(), clock_unix_secs()).expect("follows all roots at once");
 }
 
+/// Stopped after the root, before what it leads to.
+#[test]
+fn a_change_that_was_cut_off_is_made_good_by_the_next() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    publish(dir.path(), 1).expect("publishes");
+    let mut kept = client(dir.path());
+    let (root_keys, folder) = (default_root_folder(dir.path()), dir.path().join("metadata"));
+    let metadata = Metadata::open(dir.path()).expect("opens");
+    let read = |name: &str| (folder.join(name), fs_err::read(folder.join(name)).expect("reads"));
+    let before = ["timestamp.json", "1.snapshot.json", "1.targets.json"].map(read);
+    metadata
+        .change_keys(&roles(&["targets", "snapshot", "timestamp"]), &root_keys, clock_unix_secs())
+        .expect("signs");
+    for name in ["2.snapshot.json", "2.targets.json"] {
+        fs_err::remove_file(folder.join(name)).expect("removed");
+    }
+    before.iter().for_each(|(path, bytes)| fs_err::write(path, bytes).expect("written"));
+    assert!(
+        metadata.is_unfollowed().expect("read") && follow(&mut kept, dir.path(), clock_unix_secs()).is_err()
+    );
+    metadata.change_keys(&roles(&[]), &root_keys, clock_unix_secs()).expect("signs");
+    assert!(!metadata.is_unfollowed().expect("read"));
+    follow(&mut kept, dir.path(), clock_unix_secs()).expect("follows");
+}
+
 /// Two of three root keys must sign; each is on another machine.
 #[test]
 fn a_draft_is_carried_to_the_root_keys() {

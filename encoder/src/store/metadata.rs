@@ -106,6 +106,11 @@ impl MetadataReader {
         self.published(&root.body)
     }
 
+    /// Whether the newest root does not lead to what is published.
+    pub(super) fn is_unfollowed(&self) -> Result<bool, StoreError> {
+        Ok(self.is_published()? && self.published_by_newest()?.is_none())
+    }
+
     /// Targets that a root leads to, or else the store's manifest; `None` if nothing is published.
     pub(super) fn targets(&self, root: &Root) -> Result<Option<Targets>, StoreError> {
         if let Some(published) = self.published(root)? {
