@@ -162,7 +162,8 @@ impl Things {
         let area = |i: usize| axes(i)[0] * axes(i)[1] * f64::from(scene.opacities[i]);
         let points: Vec<(DVec3, f64)> = sample().filter(is_fine).map(|i| (upright(i), area(i))).collect();
         let ground = Ground::find(&points, resolution)?;
-        let along = |axis: usize| median(&mut points.iter().map(|(at, _)| at[axis]).collect::<Vec<f64>>());
+        let some = || points.iter().step_by(points.len() / 1000 + 1);
+        let along = |axis: usize| median(&mut some().map(|(at, _)| at[axis]).collect::<Vec<f64>>());
         let middle = (DVec3::new(along(0)?, along(1)?, along(2)?) / (VOXEL * resolution)).floor();
         let (voxels, of_voxel, is_narrow) = (Vec::new(), Vec::new(), Vec::new());
         let mut things = Self { upright_from_world, ground, resolution, middle, voxels, of_voxel, is_narrow };

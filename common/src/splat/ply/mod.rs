@@ -88,7 +88,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
         out.means_in_world.push(DVec3::new(*x, *y, *z));
         out.rotations_wxyz.push(unit_rotation([*w, *i, *j, *k]));
         let sharp = [s0, s1, s2].map(|s| s.exp());
-        // Yu et al. 2024, equation 9: the integral of the Gaussian stays.
+        // Yu et al., Mip-Splatting, 2024, 3D smoothing filter: the Gaussian's integral stays.
         let drawn = sharp.map(|s| if blur.is_some() { s.hypot(*f) } else { s });
         let dimmed: f64 = if blur.is_some() { (0..3).map(|i| sharp[i] / drawn[i]).product() } else { 1.0 };
         let [s0, s1, s2] = drawn.map(|s| s as f32);
