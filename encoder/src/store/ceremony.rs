@@ -100,8 +100,8 @@ impl Metadata {
             roles::promote(&self.store, role, &root.body)?;
         }
         let is_changed = |role: &str| root.body.roles[role] != present.body.roles[role];
-        // A change that was cut off leaves what the present root's keys did not sign.
-        if (roles::ONLINE.into_iter().any(is_changed) || self.is_unfollowed()?)
+        // After an interrupted change, the former keys' signatures may still stand.
+        if (roles::ONLINE.into_iter().any(is_changed) || self.is_refused()?)
             && let Some(targets) = self.targets(&present.body)?
         {
             self.sign_all(&targets, now_unix_secs)?;
@@ -152,10 +152,10 @@ impl Metadata {
 impl MetadataReader {
     pub(crate) fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
         let (root, bytes) = self.newest_root()?.ok_or_else(|| self.no_root())?;
-        if self.is_unfollowed()? {
+        if self.is_refused()? {
             tracing::warn!(
-                "robots refuse the store: the keys of root {} did not sign it, as where a change of keys was cut off; run \
-                 `slag-encoder store refresh --store {}`",
+                "robots refuse the store: its metadata is damaged, or not signed by the keys of root {}, as after an \
+                 interrupted change of keys; run `slag-encoder store refresh --store {}`",
                 root.head.version,
                 self.store.display()
             );

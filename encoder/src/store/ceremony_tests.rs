@@ -39,9 +39,9 @@ fn robots_follow_every_change_of_keys() {
     follow(&mut sleeper, dir.path(), clock_unix_secs()).expect("follows all roots at once");
 }
 
-/// Stopped after the root, before what it leads to.
+/// Interrupted after the new root was written, before the new keys signed anything.
 #[test]
-fn a_change_that_was_cut_off_is_made_good_by_the_next() {
+fn an_interrupted_change_of_keys_is_mended_by_the_next() {
     let dir = tempfile::tempdir().expect("temporary folder");
     publish(dir.path(), 1).expect("publishes");
     let mut kept = client(dir.path());
@@ -57,10 +57,10 @@ fn a_change_that_was_cut_off_is_made_good_by_the_next() {
     }
     before.iter().for_each(|(path, bytes)| fs_err::write(path, bytes).expect("written"));
     assert!(
-        metadata.is_unfollowed().expect("read") && follow(&mut kept, dir.path(), clock_unix_secs()).is_err()
+        metadata.is_refused().expect("read") && follow(&mut kept, dir.path(), clock_unix_secs()).is_err()
     );
     metadata.change_keys(&roles(&[]), &root_keys, clock_unix_secs()).expect("signs");
-    assert!(!metadata.is_unfollowed().expect("read"));
+    assert!(!metadata.is_refused().expect("read"));
     follow(&mut kept, dir.path(), clock_unix_secs()).expect("follows");
 }
 

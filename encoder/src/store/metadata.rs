@@ -106,8 +106,8 @@ impl MetadataReader {
         self.published(&root.body)
     }
 
-    /// Whether the newest root does not lead to what is published.
-    pub(super) fn is_unfollowed(&self) -> Result<bool, StoreError> {
+    /// Whether robots refuse what is published: its metadata is damaged, or not signed by the newest root's keys.
+    pub(super) fn is_refused(&self) -> Result<bool, StoreError> {
         Ok(self.is_published()? && self.published_by_newest()?.is_none())
     }
 
