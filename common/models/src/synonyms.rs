@@ -2,10 +2,16 @@
 
 use std::collections::HashSet;
 
+use crate::InferenceError;
+use crate::words::words;
+
 /// Groups of near synonyms, one per line.
 const GROUPS: &str = include_str!("synonyms.txt");
 /// Longest phrase that is searched in a text, words.
 const MAX_WORDS: usize = 4;
+/// Words between two things in a text.
+const JOINTS: &str =
+    "and or with against plus on in under above below over near beside next behind between left right by at";
 /// Endings of plurals and their singulars.
 const PLURALS: [(&str, &str); 5] = [("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")];
 
@@ -59,6 +65,21 @@ impl KnownPhrases {
         (is_other && (!self.is_closed || self.phrases.contains(&asked))).then_some(asked)
     }
 
+    /// Checks that a text does not join several known things, as "chair, person" or "bottle on the crate" do: where a
+    /// model knows few words, its vector of such a text is like one of them.
+    pub fn check_one(&self, text: &str) -> Result<(), InferenceError> {
+        let text = text.to_lowercase().replace([',', ';', '&', '+', '/'], " and ");
+        let words = words(&text);
+        let known_in = |part: &[String]| {
+            let lengths = (1..=MAX_WORDS.min(part.len())).rev();
+            let mut phrases = lengths.flat_map(|n| part.windows(n).map(|phrase| phrase.join(" ")));
+            phrases.find(|phrase| self.known_for(phrase).is_some())
+        };
+        let parts = words.split(|word| JOINTS.split(' ').any(|joint| joint == word));
+        let named: Vec<String> = parts.filter_map(known_in).collect();
+        if named.len() > 1 && !self.is_closed { Err(InferenceError::SeveralThings(named)) } else { Ok(()) }
+    }
+
     /// Returns a known phrase, also a plural, as it is; else the first known synonym.
     fn known_for(&self, phrase: &str) -> Option<String> {
         let forms: Vec<String> = [phrase.to_owned()].into_iter().chain(singulars(phrase)).collect();
@@ -97,6 +118,32 @@ mod tests {
         }
         assert_eq!(closed.asked_as("The couch").as_deref(), Some("sofa"));
         assert_eq!((closed.asked_as("a red settee"), closed.asked_as("sofas")), (None, None));
+    }
+
+    /// By hand. A closed model refuses such texts itself.
+    #[test]
+    fn several_things_in_a_text_are_refused() {
+        let phrases = ["sofa", "trash can", "table"].map(str::to_owned);
+        let [open, closed] = [false, true].map(|is_closed| KnownPhrases::new(phrases.clone(), is_closed));
+        for (text, named) in [
+            ("sofa, table", &["sofa", "table"][..]),
+            ("a red couch with tables", &["couch", "tables"]),
+            ("Trash can or the sofa", &["trash can", "sofa"]),
+            ("the sofa left of a table", &["sofa", "table"]),
+            ("black and white sofa", &[]),
+            ("sofa table", &[]),
+            ("sofa and zeppelin", &[]),
+        ] {
+            let found = open.check_one(text);
+            match named {
+                [] => found.expect(text),
+                _ => assert!(
+                    matches!(&found, Err(InferenceError::SeveralThings(of)) if of == named),
+                    "{text}: {found:?}"
+                ),
+            }
+            closed.check_one(text).expect(text);
+        }
     }
 
     #[test]

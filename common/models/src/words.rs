@@ -1,6 +1,6 @@
 //! The words of a question, prepared for a text model.
 
-use crate::InferenceError;
+use crate::{InferenceError, KnownPhrases};
 
 /// Words that name nothing to find: alone, a text model would answer them with the nearest object.
 const NAMELESS: &str = "a all an and any are at behind beneath between biggest bring by closest farthest fifth find first for fourth \
@@ -32,8 +32,10 @@ pub fn words(text: &str) -> Vec<String> {
     words.filter(|word| !word.is_empty()).map(str::to_owned).collect()
 }
 
-/// Returns the words of a text, separated by a space. Refuses a text without a word that can name something.
-pub fn words_to_find(text: &str) -> Result<String, InferenceError> {
+/// Returns the words of a text, separated by a space. Refuses a text without a word that can name something, and one
+/// that names several of the `known` phrases.
+pub fn words_to_find(text: &str, known: Option<&KnownPhrases>) -> Result<String, InferenceError> {
+    known.map_or(Ok(()), |known| known.check_one(text))?;
     let words = words(text);
     let is_nameless =
         |word: &String| NAMELESS.split_whitespace().any(|nameless| word.eq_ignore_ascii_case(nameless));
@@ -66,13 +68,16 @@ mod tests {
         for text in
             ["chair", " chair ?", "\"chair\"", "🪑 chair", "ch\u{200d}air", "\u{202e}chair", "(chair).."]
         {
-            assert_eq!(words_to_find(text).expect(text), "chair");
+            assert_eq!(words_to_find(text, None).expect(text), "chair");
         }
-        assert_eq!(words_to_find("a man’s T-shirt, size 3.5").expect("named"), "a man's T-shirt size 3.5");
-        assert_eq!(words_to_find("so\u{ad}fa🪑ch\u{200b}air").expect("named"), "sofa chair");
+        assert_eq!(
+            words_to_find("a man’s T-shirt, size 3.5", None).expect("named"),
+            "a man's T-shirt size 3.5"
+        );
+        assert_eq!(words_to_find("so\u{ad}fa🪑ch\u{200b}air", None).expect("named"), "sofa chair");
         let found = words("bottle… (on-the) ‘table’/coffee_mug -");
         assert_eq!(found, ["bottle", "on-the", "table", "coffee", "mug"]);
-        assert_eq!(words_to_find("чашка на столе").expect("named"), "чашка на столе");
+        assert_eq!(words_to_find("чашка на столе", None).expect("named"), "чашка на столе");
     }
 
     #[test]
@@ -80,7 +85,7 @@ mod tests {
         let empty =
             "|?|%|..|!!!|\"|🪑🪑|\u{200b}|the|An ?|a the|of|is|Where is the|find|go to|the largest|second|on";
         for text in empty.split('|') {
-            assert!(matches!(words_to_find(text), Err(InferenceError::EmptyText)), "{text}");
+            assert!(matches!(words_to_find(text, None), Err(InferenceError::EmptyText)), "{text}");
         }
     }
 

@@ -138,6 +138,9 @@ impl From<QueryError> for Problem {
                     InferenceError::EmptyText => {
                         RequestError::new(parameter, "nothing to look for", "words to look for").into()
                     }
+                    InferenceError::SeveralThings(named) => {
+                        RequestError::new(parameter, &named.join(", "), "one thing alone").into()
+                    }
                     InferenceError::UnknownPhrase { text, n_known, near } => {
                         unknown_words(text, format!("one of {n_known} phrases"), near)
                     }

@@ -52,7 +52,11 @@ impl OnBoard {
                 Asked::Vector { vector, .. } => vector_of(vector, snapshot.manifest.encoder.dim)?,
                 Asked::Phrase { phrase, .. } => {
                     let things = phrase.things().into_iter();
-                    let questions = things.map(|thing| Ok(question(self.encode(thing)?)));
+                    let dim = snapshot.manifest.encoder.dim as usize;
+                    let questions = things.map(|thing| match relations::is_anything(thing) {
+                        true => Ok(question(vec![0.0; dim].into())),
+                        false => Ok(question(self.encode(thing)?)),
+                    });
                     let questions = questions.collect::<Result<Vec<_>, QueryError>>()?;
                     let of_thing = snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES;
                     budget.take(questions.len() * of_thing);

@@ -52,7 +52,9 @@ impl QueryError {
         match self {
             Self::Request(_) => "bad-parameter",
             Self::Text(error) | Self::Negatives(error) => match error {
-                TextError::Encode(InferenceError::EmptyText) => "bad-parameter",
+                TextError::Encode(InferenceError::EmptyText | InferenceError::SeveralThings(_)) => {
+                    "bad-parameter"
+                }
                 TextError::Busy => "overloaded",
                 TextError::Encode(
                     InferenceError::UnknownPhrase { .. } | InferenceError::UnknownWords { .. },

@@ -152,8 +152,9 @@ impl Viewer {
     ) -> Result<T, ViewError> {
         self.with_text_encoder(|generation, OpenedText { encoder, .. }| {
             let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
-            let vectors =
-                texts.map(|text| encoder.encode(&words_to_find(text)?)).collect::<Result<Vec<_>, _>>()?;
+            let known = encoder.known_phrases().cloned();
+            let vectors = texts.map(|text| encoder.encode(&words_to_find(text, known.as_deref())?));
+            let vectors = vectors.collect::<Result<Vec<_>, _>>()?;
             work(generation, &vectors)
         })
     }
@@ -162,7 +163,7 @@ impl Viewer {
     pub(super) fn asked_as(&self, texts: &[String]) -> Result<BTreeMap<String, String>, ViewError> {
         self.with_text_encoder(|_, OpenedText { encoder, .. }| {
             let known = encoder.known_phrases();
-            let asked_as = |text: &String| known?.asked_as(&words_to_find(text).ok()?);
+            let asked_as = |text: &String| known?.asked_as(&words_to_find(text, None).ok()?);
             Ok(texts.iter().filter_map(|text| Some((text.clone(), asked_as(text)?))).collect())
         })
     }

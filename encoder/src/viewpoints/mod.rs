@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 
 use crate::ground::up;
-use crate::memory::{MemoryPlan, Phase};
+use crate::memory::{MemoryError, MemoryPlan, Phase};
 use crate::raster::{RasterError, Rasterizer};
 use looks::Look;
 use space::Space;
@@ -55,126 +55,175 @@ pub fn plan(
     memory_bytes: u64,
     cancel: &AtomicBool,
 ) -> Result<ViewpointPlan, ViewpointError> {
-    let refused = ViewpointError::Refused;
     let stride = (scene.len() / ENOUGH_GAUSSIANS).clamp(1, MAX_STRIDE);
+    check_memory(scene, stride, memory_bytes)?;
+    let grown = (stride as f32).sqrt();
+    let (thin, solid) = space::thinned(scene, stride, grown)?;
+    let up = match settings.up {
+        Some(up) => {
+            let wrong = || format!("--up {up}: expected three finite numbers, not all 0");
+            let axis = up.try_normalize().ok_or_else(|| ViewpointError::Refused(wrong()))?;
+            up::Up { axis, sign: up::Sign::Known }
+        }
+        None => up::find(&thin, &solid),
+    };
+    let planner = Planner { thin, solid, grown, rasterizer, cancel };
+    let space = planner.upright(&up)?;
+    let candidates = planner.candidates(space, up.sign, MIN_GOOD.min(settings.n_views))?;
+    if candidates.kind == SceneKind::Object && settings.up.is_none() {
+        let DVec3 { x, y, z } = candidates.space.up_in_world();
+        tracing::warn!(
+            "an object does not tell surely which way is up; taken to be ({x:.2}, {y:.2}, {z:.2}): give --up X,Y,Z if the \
+             drawings are not upright"
+        );
+    }
+    candidates.choose(settings)
+}
+
+fn check_memory(scene: &Gaussians, stride: usize, memory_bytes: u64) -> Result<(), MemoryError> {
     // Columns of means, rotations, scales, opacities and colours, and the candidates' looks.
     let mut memory = MemoryPlan::new(memory_bytes);
     memory.reserve(Phase::Always, "the scene with its colours", scene.len_bytes());
     let thin_bytes = Gaussians::decoded_bytes(scene.len() / stride, 0) as u64;
     memory.reserve(Phase::Views, "Gaussians that views are planned by", 3 * thin_bytes);
     memory.reserve(Phase::Views, "what planned views show", looks::MOST as u64 * looks::LOOK_BYTES);
-    memory.rest(0)?;
-    let grown = (stride as f32).sqrt();
-    let (thin, solid) = space::thinned(scene, stride, grown)?;
-    let up = match settings.up {
-        Some(up) => {
-            let wrong = || refused(format!("--up {up}: expected three finite numbers, not all 0"));
-            up::Up { axis: up.try_normalize().ok_or_else(wrong)?, sign: up::Sign::Known }
-        }
-        None => up::find(&thin, &solid),
-    };
-    let mut space = Space::new(&thin, &solid, grown, up.axis);
-    if matches!(up.sign, up::Sign::Unknown | up::Sign::OfSpread) {
-        let is_upside_down = match looks::kind_of(&space) {
-            SceneKind::Indoor => looks::is_upside_down(&space),
-            _ => large_from_above(&space, rasterizer)?,
-        };
-        if is_upside_down {
-            space = Space::new(&thin, &solid, grown, -up.axis);
-        }
-    }
-    let mut kind = looks::kind_of(&space);
-    let look_at = |space: &Space, kind, cameras| look_at_all(space, rasterizer, kind, cameras, cancel);
-    let mut looked = look_at(&space, kind, looks::of(kind, &space))?;
-    // A ball has no floor, and no place within; a room full of floaters has a floor.
-    let is_solid = up.sign == up::Sign::Assumed && looked.len() < MIN_GOOD;
-    if is_solid || is_object(&looked, &space, kind) {
-        // That a thing is flat does not tell which way is up.
-        if up.sign >= up::Sign::OfSpread {
-            space = Space::new(&thin, &solid, grown, up::OF_FILES);
-        }
-        kind = SceneKind::Object;
-        looked = look_at(&space, kind, looks::of(kind, &space))?;
-    } else if up.sign == up::Sign::Assumed {
-        let advice = "give it with --up X,Y,Z, for example --up 0,0,1 where z points up";
-        return Err(refused(format!("the Gaussians do not tell which way is up; {advice}")));
-    }
-    let enough = MIN_GOOD.min(settings.n_views);
-    if n_with(&looked, kind, None) < enough {
-        // Floors between storeys; or a thing that cameras among it are too near to.
-        let (other, cameras) = match kind {
-            SceneKind::Indoor => (SceneKind::Indoor, looks::of_storeys(&space)),
-            _ => (SceneKind::Object, looks::of(SceneKind::Object, &space)),
-        };
-        let others = look_at(&space, other, cameras)?;
-        if n_with(&others, other, None) >= enough {
-            (kind, looked) = (other, others);
-        }
-    }
-    if kind == SceneKind::Object && settings.up.is_none() {
-        let DVec3 { x, y, z } = space.up_in_world();
-        tracing::warn!(
-            "an object does not tell surely which way is up; taken to be ({x:.2}, {y:.2}, {z:.2}): give --up X,Y,Z if the \
-             drawings are not upright"
-        );
-    }
-    let n_candidates = looked.len();
-    let (good, bad): (Vec<Look>, Vec<Look>) =
-        looked.into_iter().partition(|look| look.verdict.fault(kind).is_none());
-    if good.len() < enough {
-        let of = format!("of {n_candidates} planned views of this {kind} scene");
-        let why = match (n_candidates, good.len()) {
-            (0, _) => format!("this {kind} scene has no free place for a camera"),
-            (_, n_good) => format!("only {n_good} {of} can be trusted ({})", faults(&bad, kind)),
-        };
-        let or_up =
-            if settings.up.is_some() { "" } else { ", or state its upward direction with --up X,Y,Z" };
-        return Err(refused(format!(
-            "{why}; give photos with --views, or remove floaters from the splat{or_up}"
-        )));
-    }
-    let (chosen, seen) = greedy(&good, space.scene.len(), settings.n_views);
-    let views = chosen.into_iter().map(|at| Viewpoint {
-        camera_from_world: space.camera_from_world(good[at].camera),
-        verdict: good[at].verdict,
-    });
-    Ok(ViewpointPlan {
-        kind,
-        up_in_world: space.up_in_world(),
-        views: views.collect(),
-        n_candidates,
-        n_good: good.len(),
-        seen,
-    })
+    memory.rest(0).map(drop)
 }
 
-fn look_at_all(
-    space: &Space,
-    rasterizer: &dyn Rasterizer,
+struct Planner<'a> {
+    /// Some of the scene's Gaussians, enlarged by `grown`, in its world; and which of them are solid.
+    thin: Gaussians,
+    solid: Vec<u32>,
+    grown: f32,
+    rasterizer: &'a dyn Rasterizer,
+    cancel: &'a AtomicBool,
+}
+
+/// Views that were looked at, good and bad.
+struct Candidates {
+    space: Space,
     kind: SceneKind,
-    cameras: Vec<DAffine3>,
-    cancel: &AtomicBool,
-) -> Result<Vec<Look>, ViewpointError> {
-    let loaded = rasterizer.load(&space.scene)?;
-    let looked = cameras.into_par_iter().map(|camera| {
-        if cancel.load(Ordering::Relaxed) {
-            return Err(ViewpointError::Interrupted);
+    looked: Vec<Look>,
+}
+
+impl Planner<'_> {
+    fn space(&self, up: DVec3) -> Space {
+        Space::new(&self.thin, &self.solid, self.grown, up)
+    }
+
+    /// The scene with its upper side above, which its contents tell where the axis alone is known.
+    fn upright(&self, up: &up::Up) -> Result<Space, ViewpointError> {
+        let space = self.space(up.axis);
+        if !matches!(up.sign, up::Sign::Unknown | up::Sign::OfSpread) {
+            return Ok(space);
         }
-        Ok(looks::look(loaded.as_ref(), space, camera, kind)?)
-    });
-    looked.collect::<Vec<_>>().into_iter().collect()
+        let is_upside_down = match looks::kind_of(&space) {
+            SceneKind::Indoor => looks::is_upside_down(&space),
+            _ => large_from_above(&space, self.rasterizer)?,
+        };
+        Ok(if is_upside_down { self.space(-up.axis) } else { space })
+    }
+
+    /// Looks from where the kind of scene asks for; a kind that gives fewer than `enough` good views may be another.
+    fn candidates(&self, space: Space, sign: up::Sign, enough: usize) -> Result<Candidates, ViewpointError> {
+        let kind = looks::kind_of(&space);
+        let looked = self.look_at_all(&space, kind, looks::of(kind, &space))?;
+        let mut found = Candidates { space, kind, looked };
+        // A ball has no floor, and no place within; a room full of floaters has a floor.
+        let is_solid = sign == up::Sign::Assumed && found.looked.len() < MIN_GOOD;
+        if is_solid || found.are_of_an_object() {
+            // That a thing is flat does not tell which way is up.
+            if sign >= up::Sign::OfSpread {
+                found.space = self.space(up::OF_FILES);
+            }
+            let cameras = looks::of(SceneKind::Object, &found.space);
+            found.looked = self.look_at_all(&found.space, SceneKind::Object, cameras)?;
+            found.kind = SceneKind::Object;
+        } else if sign == up::Sign::Assumed {
+            return Err(ViewpointError::Refused(
+                "the Gaussians do not tell which way is up; give it with --up X,Y,Z, for example --up 0,0,1 where z points up"
+                    .to_owned(),
+            ));
+        }
+        if n_with(&found.looked, found.kind, None) < enough {
+            // Floors between storeys; or a thing that cameras among it are too near to.
+            let (kind, cameras) = match found.kind {
+                SceneKind::Indoor => (SceneKind::Indoor, looks::of_storeys(&found.space)),
+                _ => (SceneKind::Object, looks::of(SceneKind::Object, &found.space)),
+            };
+            let looked = self.look_at_all(&found.space, kind, cameras)?;
+            if n_with(&looked, kind, None) >= enough {
+                found = Candidates { kind, looked, ..found };
+            }
+        }
+        Ok(found)
+    }
+
+    fn look_at_all(
+        &self,
+        space: &Space,
+        kind: SceneKind,
+        cameras: Vec<DAffine3>,
+    ) -> Result<Vec<Look>, ViewpointError> {
+        let loaded = self.rasterizer.load(&space.scene)?;
+        let looked = cameras.into_par_iter().map(|camera| {
+            if self.cancel.load(Ordering::Relaxed) {
+                return Err(ViewpointError::Interrupted);
+            }
+            Ok(looks::look(loaded.as_ref(), space, camera, kind)?)
+        });
+        looked.collect::<Vec<_>>().into_iter().collect()
+    }
+}
+
+impl Candidates {
+    /// Whether the scene is a thing with nothing around it: from within, one looks past it, and it is tall, or there is
+    /// no other way to look at it.
+    fn are_of_an_object(&self) -> bool {
+        let Self { space, kind, looked } = self;
+        let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
+        2 * n_with(looked, *kind, Some(plan::HOLES)) > looked.len()
+            && (is_tall || n_with(looked, *kind, None) < MIN_GOOD)
+    }
+
+    fn choose(self, settings: &ViewpointSettings) -> Result<ViewpointPlan, ViewpointError> {
+        let Self { space, kind, looked } = self;
+        let n_candidates = looked.len();
+        let (good, bad): (Vec<Look>, Vec<Look>) =
+            looked.into_iter().partition(|look| look.verdict.fault(kind).is_none());
+        if good.len() < MIN_GOOD.min(settings.n_views) {
+            let why = match n_candidates {
+                0 => format!("this {kind} scene has no free place for a camera"),
+                _ => format!(
+                    "only {} of {n_candidates} planned views of this {kind} scene can be trusted ({})",
+                    good.len(),
+                    faults(&bad, kind)
+                ),
+            };
+            let or_up =
+                if settings.up.is_some() { "" } else { ", or state its upward direction with --up X,Y,Z" };
+            return Err(ViewpointError::Refused(format!(
+                "{why}; give photos with --views, or remove floaters from the splat{or_up}"
+            )));
+        }
+        let (chosen, seen) = greedy(&good, space.scene.len(), settings.n_views);
+        let view = |at: usize| Viewpoint {
+            camera_from_world: space.camera_from_world(good[at].camera),
+            verdict: good[at].verdict,
+        };
+        Ok(ViewpointPlan {
+            kind,
+            up_in_world: space.up_in_world(),
+            views: chosen.into_iter().map(view).collect(),
+            n_candidates,
+            n_good: good.len(),
+            seen,
+        })
+    }
 }
 
 fn n_with(looked: &[Look], kind: SceneKind, fault: Option<&str>) -> usize {
     looked.iter().filter(|look| look.verdict.fault(kind) == fault).count()
-}
-
-/// Whether a scene is a thing with nothing around it: from within, one looks past it, and it is tall, or there is no
-/// other way to look at it.
-fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
-    let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
-    2 * n_with(looked, kind, Some(plan::HOLES)) > looked.len()
-        && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
 }
 
 fn faults(bad: &[Look], kind: SceneKind) -> String {

@@ -7,6 +7,7 @@ use serde::Serialize;
 use slag_common::manifest::Manifest;
 
 use super::geometry::Solid;
+use super::phrase::is_anything;
 use crate::query::cluster::Cluster;
 use crate::query::objects::{self, FoundObject, ScoredObjects};
 use crate::query::request::QueryRequest;
@@ -93,12 +94,17 @@ impl<'a> Things<'a> {
         request: &QueryRequest,
     ) -> Self {
         let of = things.iter().zip(questions).zip(scored);
-        let of = of.map(|((thing, question), scored)| candidates(scene, thing, question, scored, request));
+        let of = of.map(|((thing, question), scored)| match is_anything(thing) {
+            true => every_object(scene, thing, scored.scores.len(), request),
+            false => candidates(scene, thing, question, scored, request),
+        });
         Self { of: of.collect() }
     }
 
+    /// Numbers of the named things that no object answers.
     pub fn open(&self) -> Vec<usize> {
-        (0..self.of.len()).filter(|at| self.of[*at].1.is_empty()).collect()
+        let is_open = |(found, of): &(Found, Vec<_>)| of.is_empty() && !is_anything(&found.thing);
+        (0..self.of.len()).filter(|at| is_open(&self.of[*at])).collect()
     }
 
     /// Makes clusters the candidates of a thing, by its number.
@@ -149,22 +155,48 @@ fn candidates<'a>(
     found.truncate(MAX_CANDIDATES);
     let best_score = objects::best(&scored.scores).map(|best| scale.shown(scored.scores[best]));
     let base = scale.base(calibration);
-    let (region, alignment) = (&request.region, alignment(scene.manifest));
     let candidate = |found: FoundObject<'a>| {
-        let oriented = objects::oriented_box(scene, &found, &everywhere, alignment);
         let score = scale.shown(found.score);
-        Candidate {
-            solid: Solid::of(&oriented, &found.record.bounds()),
-            score,
-            confidence: confidence(score, best_score.unwrap_or(base), base),
-            is_inside: objects::in_region(scene, found.object, region, request.min_count),
-            id: found.public_id(),
-            of: CandidateOf::Object(found),
-        }
+        let confidence = confidence(score, best_score.unwrap_or(base), base);
+        candidate(scene, found, (score, confidence), request)
     };
     let candidates: Vec<Candidate<'a>> = found.into_par_iter().map(candidate).collect();
     let candidates = whole(candidates, metre(scene.manifest));
     (Found { thing: thing.to_owned(), n_found, threshold, best_score }, candidates)
+}
+
+/// The candidates for "thing": all objects, each surely one, and none a piece of another.
+fn every_object<'a>(
+    scene: &Scene<'a>,
+    thing: &str,
+    n_objects: usize,
+    request: &QueryRequest,
+) -> (Found, Vec<Candidate<'a>>) {
+    let everywhere = Region::default();
+    let scores = vec![1.0; n_objects];
+    let objects = ScoredObjects { scene, scores: &scores, region: &everywhere, min_count: request.min_count };
+    let found = objects.reaching(0.0);
+    let n_found = found.len();
+    let candidates =
+        found.into_par_iter().map(|found| candidate(scene, found, (1.0, 1.0), request)).collect();
+    (Found { thing: thing.to_owned(), n_found, threshold: 0.0, best_score: None }, candidates)
+}
+
+fn candidate<'a>(
+    scene: &Scene<'a>,
+    found: FoundObject<'a>,
+    (score, confidence): (f32, f64),
+    request: &QueryRequest,
+) -> Candidate<'a> {
+    let oriented = objects::oriented_box(scene, &found, &Region::default(), alignment(scene.manifest));
+    Candidate {
+        solid: Solid::of(&oriented, &found.record.bounds()),
+        score,
+        confidence,
+        is_inside: objects::in_region(scene, found.object, &request.region, request.min_count),
+        id: found.public_id(),
+        of: CandidateOf::Object(found),
+    }
 }
 
 /// Returns the confidence of a score: 0 at `base`, 1 at the best.

@@ -48,6 +48,7 @@ const OPENINGS: &str = "please, where is, where are, where's, find me, find, sho
 /// Words before a relation that ask for any thing.
 const ANY: [&str; 3] = ["what is", "what's", "what are"];
 const NEGATIONS: [&str; 4] = ["not", "isn't", "aren't", "never"];
+const EXCEPTIONS: [&str; 5] = ["without", "except", "but", "besides", "excluding"];
 /// Words that make "within" a distance.
 const UNITS: &str = "m metre metres meter meters cm centimetres centimeters foot feet ft inches yards";
 
@@ -80,10 +81,14 @@ fn refuse(words: &[&str]) -> Result<(), RequestError> {
     let refused = |found: String, expected: String| Err(RequestError::new("text", &found, expected));
     for at in 1..words.len() {
         let (here, after) = (words[at], &words[at + 1..]);
-        if !after.is_empty() && (here == "without" || NEGATIONS.contains(&here) && relation(after).is_some())
-        {
+        let turns = EXCEPTIONS.contains(&here) || NEGATIONS.contains(&here) && relation(after).is_some();
+        if !after.is_empty() && turns {
             let named = thing(&words[..at]).map_or_else(|| "the thing".to_owned(), |of| of.thing);
             let advice = format!("no {here:?}, which relations do not understand; ask for {named:?} alone");
+            return refused(words.join(" "), advice);
+        }
+        if matches!(here, "and" | "or") && relation(after).is_some() {
+            let advice = format!("one place for a thing; ask for {:?} alone", words[..at].join(" "));
             return refused(words.join(" "), advice);
         }
         if here == "within" && after.iter().take(3).any(|word| UNITS.split(' ').any(|unit| unit == *word)) {
@@ -329,6 +334,9 @@ mod tests {
         for (text, named) in [
             ("chair not near the table", "\"not\""),
             ("chair without arms", "\"without\""),
+            ("anything but the bottle", "\"but\""),
+            ("chair except the red one", "\"except\""),
+            ("picture above the television and left of the clock", "\"picture above the television\" alone"),
             ("chair within 3 m of the door", "radius"),
             ("twenty-first nearest chair", "100th"),
             ("the second chair from the left", "left of me"),

@@ -11,8 +11,16 @@ use crate::text::MAX_TEXT_BYTES;
 /// Most things that a phrase may name.
 pub const MAX_THINGS: usize = 8;
 pub const MAX_NTH: usize = 100;
-/// Names for the asker.
-pub const ASKER: [&str; 4] = ["me", "myself", "us", "here"];
+/// Names for the asker, who may be asked: "behind you".
+pub const ASKER: [&str; 5] = ["me", "myself", "us", "here", "you"];
+/// Names for any thing.
+const ANYTHING: [&str; 9] =
+    ["thing", "things", "object", "objects", "item", "items", "anything", "something", "everything"];
+
+/// Whether a thing's name stands for every object.
+pub fn is_anything(thing: &str) -> bool {
+    ANYTHING.contains(&thing.trim().to_lowercase().as_str())
+}
 
 /// A thing, chosen by what it is, where it is, and how it compares with others of its kind.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -176,6 +184,10 @@ impl Phrase {
         }
         if self.n_things() > MAX_THINGS {
             return refuse(&format!("{} things", self.n_things()), &format!("at most {MAX_THINGS}"));
+        }
+        let n_unnamed = self.things().into_iter().filter(|thing| is_anything(thing)).count();
+        if n_unnamed > 1 || self.inner().any(|of| is_anything(&of.thing) && is_anything(&self.thing)) {
+            return refuse(&self.thing, "a phrase that names all its things but one");
         }
         self.check_parts()
     }
