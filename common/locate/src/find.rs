@@ -112,6 +112,8 @@ pub enum Reason {
     NoPose {
         inliers: usize,
     },
+    /// Its mirror image agrees with more landmarks. A mirrored wall is a wall seen from behind, also to renderings.
+    Mirrored,
     /// The landmarks that agree lie in one corner of the photo.
     NoSpread,
     /// The pose contradicts the direction of gravity.
@@ -137,6 +139,7 @@ impl std::fmt::Display for Reason {
                     "the best pose agrees with {inliers} landmarks: nothing on board looks like this photo"
                 )
             }
+            Self::Mirrored => write!(f, "the photo is mirrored; give it as the camera saw it"),
             Self::NoSpread => write!(f, "the landmarks that agree lie in one small part of the photo"),
             Self::Gravity => {
                 write!(f, "the best pose contradicts the direction of gravity by more than 10 degrees")
@@ -155,14 +158,17 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     if found.len() < MIN_FEATURES {
         return Outcome::Lost(Reason::FewFeatures { found: found.len() });
     }
-    let at = found.iter().map(|feature| ideal(photo.intrinsics, feature)).collect();
-    let query = Query { at, codes: found.iter().map(|feature| code(&feature.descriptor)).collect() };
+    let query = query(&found, photo.intrinsics);
     let size_px = DVec2::new(f64::from(photo.intrinsics.width_px), f64::from(photo.intrinsics.height_px));
     let all = query.match_all(map);
     let camera = Pinhole::new(photo.intrinsics);
     let search = Search { map, photo, query, all, camera, size_px, zoomed: OnceCell::new() };
     let mut proposals = search.proposals();
     let inliers = proposals.first().map_or(0, |best| best.inliers.len());
+    let is_weak = inliers < MIN_INLIERS_AGAINST_RENDERING;
+    if is_weak && mirrored_inliers(map, photo) > inliers.max(MIN_UNSURE_INLIERS) {
+        return Outcome::Lost(Reason::Mirrored);
+    }
     let contradiction = |one: &Agreed| photo.contradiction(&one.camera_from_world);
     let refused = proposals.iter().find_map(contradiction);
     proposals.retain(|one| contradiction(one).is_none());
@@ -179,6 +185,20 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
         Outcome::Found(found) if found.other_focal_px.is_some() => Outcome::Unsure(vec![*found]),
         outcome => outcome,
     }
+}
+
+fn query(found: &[Feature], intrinsics: &Intrinsics) -> Query {
+    let at = found.iter().map(|feature| ideal(intrinsics, feature)).collect();
+    Query { at, codes: found.iter().map(|feature| code(&feature.descriptor)).collect() }
+}
+
+/// Landmarks that agree with the photo's mirror image.
+fn mirrored_inliers(map: &Map, photo: &Photo<'_>) -> usize {
+    let of = photo.intrinsics;
+    let intrinsics = Intrinsics { centre_x_px: f64::from(of.width_px) - of.centre_x_px, ..*of };
+    let query = query(&features(&photo.grey.mirrored(), MAX_FEATURES), &intrinsics);
+    ransac(&Pinhole::new(&intrinsics), &query.match_all(map), SEED, MAX_SAMPLES)
+        .map_or(0, |of| of.inliers.len())
 }
 
 const SEED: u64 = 47;

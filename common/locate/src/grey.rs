@@ -23,6 +23,11 @@ impl Grey {
         Self { width, height, values: rgb.as_chunks().0.iter().map(luma).collect() }
     }
 
+    pub(crate) fn mirrored(&self) -> Self {
+        let rows = self.values.chunks_exact(self.width.max(1));
+        Self { values: rows.flat_map(|row| row.iter().rev().copied()).collect(), ..*self }
+    }
+
     /// Doubles the size (bilinear); pixel (x, y) moves to (2x, 2y).
     pub(crate) fn doubled(&self) -> Self {
         let (width, height) = (self.width * 2, self.height * 2);

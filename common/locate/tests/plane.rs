@@ -109,6 +109,12 @@ fn a_photo_is_located_and_another_floor_is_lost() {
     assert!(matches!(near(DVec3::new(0.0, 0.0, 1.7)), Outcome::Found(_)));
     assert_eq!(near(DVec3::new(0.6, -1.1, 4.0)), Outcome::Lost(Reason::Prior));
     // Another floor; then the right pose, but a splat of another floor, which verifies nothing.
+    let values: Vec<f32> = grey.values.chunks(grey.width).flat_map(|row| row.iter().rev().copied()).collect();
+    let mirrored = Grey { values, ..grey };
+    for renderer in [None, Some(&Floor(1) as &dyn Renderer)] {
+        let outcome = locate(&map, &Photo { grey: &mirrored, ..photo }, renderer);
+        assert_eq!(outcome, Outcome::Lost(Reason::Mirrored));
+    }
     let other = draw(2, &truth, &INTRINSICS).grey;
     assert!(matches!(locate(&map, &Photo { grey: &other, ..photo }, None), Outcome::Lost(_)));
     let Outcome::Found(found) = locate(&map, &photo, Some(&Floor(2))) else { panic!("lost") };

@@ -32,8 +32,8 @@ pub struct LocateArgs {
     /// Principal point, pixels from the left and the top [default: the middle of the photo].
     #[arg(long, value_name = "X,Y", value_parser = parse_centre)]
     pub centre_px: Option<[f64; 2]>,
-    /// Direction of gravity in the camera's frame (x right, y down, z forward), as an IMU measures it: poses that
-    /// contradict it are refused.
+    /// Direction of gravity in the camera's frame (x right, y down, z forward), opposite to what an accelerometer at rest
+    /// measures: poses that contradict it are refused.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     pub gravity: Option<DVec3>,
     /// Where the camera may be, world frame, with --sigma: poses elsewhere are refused.

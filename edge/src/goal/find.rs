@@ -35,9 +35,13 @@ pub fn find(on_board: &OnBoard, request: &GoalRequest, budget: &Budget) -> Resul
     let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, voxel, near);
     let Some(start) = seen.start(near, request.robot.radius_m) else {
         let detail = format!(
-            "within {START_M} m of [{:.2}, {:.2}, {:.2}], where the robot is taken to be, no known ground at that height is {} m \
-             clear; give a place on the ground as near (--near X,Y,Z)",
-            near.x, near.y, near.z, request.robot.radius_m
+            "within {START_M} m of [{:.2}, {:.2}, {:.2}], where the robot is taken to be, no known ground at that height has {} m \
+             free around it and {:.1} m above; give a place on the ground as near (--near X,Y,Z), or a smaller robot",
+            near.x,
+            near.y,
+            near.z,
+            request.robot.radius_m,
+            request.robot.height()
         );
         reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });
         return Ok(reply);
@@ -63,25 +67,29 @@ pub fn find(on_board: &OnBoard, request: &GoalRequest, budget: &Budget) -> Resul
             Err(none) => reply.missed.push(MissedThing { thing, none }),
         }
     }
-    reply.none =
-        reply.missed.first().map(|missed| GoalMiss { kind: missed.none, detail: detail(missed, request) });
+    reply.none = reply
+        .missed
+        .first()
+        .map(|missed| GoalMiss { kind: missed.none, detail: detail(missed, request, voxel) });
     Ok(reply)
 }
 
-fn detail(missed: &MissedThing, request: &GoalRequest) -> String {
+fn detail(missed: &MissedThing, request: &GoalRequest, voxel: f64) -> String {
+    let step_m = request.robot.step_m(voxel);
     let MissedThing { thing: TargetThing { id, .. }, none } = missed;
-    let Robot { radius_m, range_m, sensor_height_m, .. } = request.robot;
+    let Robot { radius_m, range_m, sensor_height_m, slope, .. } = request.robot;
     let Stand { reach_m, min_visible, .. } = request.stand;
     match none {
         NoGoal::NoSuchThing => format!("{id} is not on board"),
         NoGoal::Unreachable => format!(
-            "no way for a robot of {radius_m} m radius leads within {reach_m} m of {id}; a larger reach_m or a smaller radius_m may"
+            "no way within {range_m} m leads a robot of {radius_m} m radius, up steps of {step_m} m and slopes of {slope}, to within \
+             {reach_m} m of {id}; a larger step_m, slope, range_m or reach_m may, or a smaller radius_m"
         ),
         NoGoal::UnknownGround => format!(
             "most ground within {reach_m} m of {id} is not known, or farther than {range_m} m from the robot"
         ),
         NoGoal::NotVisible => format!(
-            "from no place within {reach_m} m a sensor {sensor_height_m} m above the ground sees {:.0} % of {id}",
+            "no place within {reach_m} m shows {:.0} % of {id} to a sensor {sensor_height_m} m above the ground",
             100.0 * min_visible
         ),
     }

@@ -47,6 +47,7 @@ pub struct Robot {
     #[schemars(range(min = HEIGHT_M[0], max = HEIGHT_M[1]), example = 0.5, skip_serializing_if = "Option::is_none")]
     pub height_m: Option<f64>,
     /// Highest step that it climbs, 1.5 of the scene's voxels or more; by default 0.1, or 0.15 with voxels of 0.1 m.
+    /// Heights are known to a voxel, so steps that may be higher are refused: those that look higher than half a voxel less.
     #[arg(long, value_name = "M")]
     #[schemars(range(min = STEP_M[0], max = STEP_M[1]), example = 0.1, skip_serializing_if = "Option::is_none")]
     pub step_m: Option<f64>,

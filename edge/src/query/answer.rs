@@ -15,10 +15,10 @@ use super::oriented::Extent;
 use super::reason::{self, BestObject};
 use super::relations::{self, CandidateOf, ClustersOfThing, Phrase, Things, Viewer};
 use super::request::{AnswerKind, Asked, QueryRequest, RequestError, unit_vector};
-use super::scale::{Scale, ThresholdSource};
+use super::scale::{Scale, ScoreKind, ThresholdSource};
 use super::scene::{Scene, alignment, default_voxel, unit};
 use crate::score::{Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Search, score_objects};
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{Calibration, Manifest};
 
 /// Memory for the candidates of a thing: 256 of 1 kB.
 const CANDIDATES_BYTES: usize = 256 << 10;
@@ -41,7 +41,8 @@ impl OnBoard {
         request.understand(snapshot)?;
         request.check()?;
         let negatives = self.encode_negatives(&request)?;
-        let question = |vector: Arc<[f32]>| Question { vector, negatives: negatives.clone() };
+        let question =
+            |vector: Arc<[f32]>| Question { negatives: negatives.clone(), ..Question::new(vector) };
         let scene = Scene::of(snapshot);
         let answering = Answering { scene: &scene, request: &request, budget };
         let mut all: Vec<Option<Answers>> = request.asked.iter().map(|_| None).collect();
@@ -52,9 +53,11 @@ impl OnBoard {
                 Asked::Vector { vector, .. } => vector_of(vector, snapshot.manifest.encoder.dim)?,
                 Asked::Phrase { phrase, .. } => {
                     let things = phrase.things().into_iter();
-                    let dim = snapshot.manifest.encoder.dim as usize;
+                    // Every object is a thing, whatever its score.
+                    let any: Arc<[f32]> =
+                        (0..snapshot.manifest.encoder.dim).map(|at| f32::from(at == 0)).collect();
                     let questions = things.map(|thing| match relations::is_anything(thing) {
-                        true => Ok(question(vec![0.0; dim].into())),
+                        true => Ok(question(Arc::clone(&any))),
                         false => Ok(question(self.encode(thing)?)),
                     });
                     let questions = questions.collect::<Result<Vec<_>, QueryError>>()?;
@@ -172,14 +175,26 @@ impl Answering<'_> {
 
     fn by_objects(&self, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
         let Scene { shards, objects, index, .. } = self.scene;
+        let questions = self.bounded(asked.1, objects::calibration(objects));
+        let asked = (asked.0, &*questions);
         let scored = score_objects(shards, objects, index, asked.1)?;
         self.each(asked, &scored, |text, question, scored| self.objects(text, question, scored))
     }
 
     fn by_gaussians(&self, asked: Questions<'_>, kind: AnswerKind) -> Result<Vec<Answers>, ScoreError> {
         let (region, precision) = (&self.request.region, self.request.precision);
+        let questions = self.bounded(asked.1, self.scene.manifest.encoder.calibration);
+        let asked = (asked.0, &*questions);
         let searches = Search::batch(&self.scene.shards, asked.1, region, precision, self.budget)?;
         self.each(asked, &searches, |text, question, search| self.gaussians((text, kind), question, search))
+    }
+
+    /// Bounds negatives by what answers a question without them, unless the request states what answers.
+    fn bounded(&self, questions: &[Question], calibration: Option<Calibration>) -> Vec<Question> {
+        let (request, manifest) = (self.request, self.scene.manifest);
+        let plain = Scale(ScoreKind::Cosine).threshold(request, manifest, calibration).0;
+        let least = if request.threshold.is_some() { f32::NEG_INFINITY } else { plain };
+        questions.iter().map(|question| Question { least, ..question.clone() }).collect()
     }
 
     /// Answers each question from its scores; only the bytes of its answers stay charged.
@@ -329,6 +344,7 @@ impl Answering<'_> {
     fn clusters_of_things(&self, questions: &[Question]) -> Result<Vec<ClustersOfThing>, ScoreError> {
         let Scene { manifest, shards, .. } = self.scene;
         let (everywhere, precision) = (Region::default(), self.request.precision);
+        let questions = &*self.bounded(questions, manifest.encoder.calibration);
         let searches = Search::batch(shards, questions, &everywhere, precision, self.budget)?;
         let of_thing = |(question, search): (&Question, &Search<'_>)| {
             let (scale, calibration) = (Scale::of(question), manifest.encoder.calibration);
@@ -349,7 +365,8 @@ impl Answering<'_> {
                             metres, encode it with --metric";
             return Err(RequestError::new("phrases", &phrase.thing, expected).into());
         }
-        let scored = score_objects(&scene.shards, &scene.objects, scene.index, questions)?;
+        let bounded = self.bounded(questions, objects::calibration(&scene.objects));
+        let scored = score_objects(&scene.shards, &scene.objects, scene.index, &bounded)?;
         let mut things = Things::find(scene, &phrase.things(), questions, &scored, request);
         let open = if request.kind == Some(AnswerKind::Objects) { Vec::new() } else { things.open() };
         if !open.is_empty() {

@@ -51,8 +51,7 @@ impl Names {
         let together = || (0..).step_by(WORDS_TOGETHER).zip(words.chunks(WORDS_TOGETHER));
         let scores = |together: &[WordVector]| {
             budget.check()?;
-            let question =
-                |(_, vector): &WordVector| Question { vector: Arc::clone(vector), negatives: Vec::new() };
+            let question = |(_, vector): &WordVector| Question::new(Arc::clone(vector));
             let questions: Vec<Question> = together.iter().map(question).collect();
             score_objects(&scene.shards, &scene.objects, scene.index, &questions)
         };

@@ -112,8 +112,8 @@ impl Engine {
         request.check()?;
         let on_board = self.on_board()?;
         on_board.check()?;
-        let question =
-            Question { vector: on_board.encode(&text)?, negatives: on_board.encode_negatives(&request)? };
+        let negatives = on_board.encode_negatives(&request)?;
+        let question = Question { negatives, ..Question::new(on_board.encode(&text)?) };
         let scene = Scene::of(&on_board.snapshot);
         Ok(scores_message(&scene.shards, &question, scene.manifest.generation, budget)?)
     }

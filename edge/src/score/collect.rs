@@ -168,7 +168,7 @@ impl Cell<'_> {
         let embedding = &embeddings[at * dim..][..dim];
         let product = |vector| self.instructions.dispatch(EmbeddingTimesVector(embedding, vector));
         let mut products = self.asked.question.vectors().map(product);
-        combine(products.next().unwrap_or(0.0), products)
+        combine(products.next().unwrap_or(0.0), products, self.asked.question.least)
     }
 
     /// Scores members of a centroid by their codes; those that reach the threshold go to `gather.refine`.
@@ -215,7 +215,7 @@ impl Cell<'_> {
                 let (least, step) = self.line(*place, centroid, residuals);
                 least + step * f32::from(last.sums[within])
             });
-            let score = combine(own + step * f32::from(*sum), negatives);
+            let score = combine(own + step * f32::from(*sum), negatives, self.asked.question.least);
             if score >= threshold {
                 refine.members.push((*at, score));
             }
@@ -272,7 +272,7 @@ impl Cell<'_> {
             }
             for (number, (place, _)) in undecided.iter().enumerate() {
                 let mut products = scores[number..].iter().step_by(which.len()).copied();
-                let score = combine(products.next().unwrap_or(0.0), products);
+                let score = combine(products.next().unwrap_or(0.0), products, self.asked.question.least);
                 // The embedding's score lies within this bound, whatever the residual says.
                 let (of_centroid, bound) = (self.centroids[centroid], self.embedding_bound(centroid));
                 members[*place].1 = score.max(of_centroid - bound).min(of_centroid + bound);

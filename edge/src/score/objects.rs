@@ -46,7 +46,7 @@ pub fn score_objects(
         let scored =
             vectors.iter().map(|v| of_vector(instructions, &shards[at], objects, index.first_in(at), v));
         let scored: Vec<ObjectScores> = scored.collect();
-        places.iter().map(|places| of_question(&scored, places)).collect()
+        questions.iter().zip(&places).map(|(of, places)| of_question(&scored, places, of.least)).collect()
     };
     let by_shard: Vec<Vec<ObjectScores>> = objects.par_iter().enumerate().map(of_shard).collect();
     let mut all = vec![ObjectScores { scores: vec![0.0; index.len()], error_bound: 0.0 }; questions.len()];
@@ -62,9 +62,9 @@ pub fn score_objects(
 }
 
 /// Combines the scores of a question's vector and its negatives, listed by `places` in this order.
-fn of_question(scored: &[ObjectScores], places: &[usize]) -> ObjectScores {
+fn of_question(scored: &[ObjectScores], places: &[usize], least: f32) -> ObjectScores {
     let (own, negatives) = (&scored[places[0]], &places[1..]);
-    let of = |(at, own): (usize, &f32)| combine(*own, negatives.iter().map(|n| scored[*n].scores[at]));
+    let of = |(at, own): (usize, &f32)| combine(*own, negatives.iter().map(|n| scored[*n].scores[at]), least);
     let largest = negatives.iter().map(|n| scored[*n].error_bound + f32::EPSILON).reduce(f32::max);
     ObjectScores {
         scores: own.scores.iter().enumerate().map(of).collect(),

@@ -15,19 +15,21 @@ use super::dot::rounding_bound;
 
 pub use slag_math::relevancy::{RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 
-/// A question as vectors. A Gaussian's score is `q · E_k`, or with negatives `q · E_k - max_j n_j · E_k`: its margin
-/// over the closest negative (LERF, Kerr et al. 2023, section 3.3; [`relevancy`] maps it to 0..1).
+/// A question as vectors. A Gaussian's score is `q · E_k`, or with negatives `q · E_k - max(max_j n_j · E_k, least)`: its
+/// margin over the closest negative (LERF, Kerr et al. 2023, section 3.3; [`relevancy`] maps it to 0..1).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
     /// `[dim]`, unit length.
     pub vector: Arc<[f32]>,
     /// `[dim]` each, unit length; if empty, the score is the cosine.
     pub negatives: Vec<Arc<[f32]>>,
+    /// What the closest negative scores at least: what answers a question without negatives, so that they never add any.
+    pub least: f32,
 }
 
 impl Question {
     pub fn new(vector: impl Into<Arc<[f32]>>) -> Self {
-        Self { vector: vector.into(), negatives: Vec::new() }
+        Self { vector: vector.into(), negatives: Vec::new(), least: f32::NEG_INFINITY }
     }
 
     /// Returns all vectors, the question's own first.
@@ -55,12 +57,12 @@ impl Question {
         Ok(())
     }
 
-    /// Returns the most that a score changes when an embedding moves by 1: the length of `q`, or of the longest `q -
-    /// n_j`, because the score is the minimum of all `(q - n_j) · E`.
+    /// Returns the most that a score changes when an embedding moves by 1: the length of `q`, or of the longest `q - n_j`
+    /// if greater, because the score is the minimum of all `(q - n_j) · E` and of `q · E - least`.
     pub(crate) fn steepness(&self) -> f32 {
         let own = length(self.vector.iter().copied());
         let apart = |n: &Arc<[f32]>| length(self.vector.iter().zip(&**n).map(|(q, n)| q - n));
-        let largest = self.negatives.iter().map(apart).reduce(f64::max).unwrap_or(own);
+        let largest = self.negatives.iter().map(apart).fold(own, f64::max);
         (largest * (1.0 + f64::from(f32::EPSILON))) as f32
     }
 
@@ -141,12 +143,12 @@ mod tests {
             for _ in 0..2000 {
                 let mut unit = || Arc::from(random.unit_vector(dim));
                 let (vector, negatives) = (unit(), (0..n_negatives).map(|_| unit()).collect());
-                let question = Question { vector, negatives };
+                let question = Question { vector, negatives, least: random.between(-1.0, 1.0) as f32 };
                 let score = |e: &[f32]| {
                     let dot =
                         |v: &[f32]| v.iter().zip(e).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
-                    let worst = question.negatives.iter().map(|n| dot(n)).reduce(f64::max).unwrap_or(0.0);
-                    dot(&question.vector) - worst
+                    let worst = question.negatives.iter().map(|n| dot(n)).reduce(f64::max);
+                    dot(&question.vector) - worst.map_or(0.0, |worst| worst.max(question.least.into()))
                 };
                 let (at, step) = (random.unit_vector(dim), random.unit_vector(dim));
                 let moved: Vec<f32> = at.iter().zip(&step).map(|(a, s)| a + 0.25 * s).collect();

@@ -113,7 +113,7 @@ impl<'a> Search<'a> {
         let (vectors, places) = distinct(questions);
         let score = |shard: &ShardView<'_>| {
             let is_searched = region.touches(&shard.position_box());
-            is_searched.then(|| ShardScores::new(shard, &vectors, &places, precision))
+            is_searched.then(|| ShardScores::new(shard, questions, (&vectors, &places), precision))
         };
         let scored: Arc<[_]> = shards.par_iter().map(score).collect::<Vec<_>>().into();
         let searches = questions.iter().zip(places).enumerate().map(|(index, (question, places))| Self {
@@ -173,7 +173,12 @@ pub(super) fn distinct(questions: &[Question]) -> (Vec<Vector>, Vec<Vec<usize>>)
 }
 
 impl ShardScores {
-    fn new(shard: &ShardView<'_>, vectors: &[Vector], places: &[Vec<usize>], precision: Precision) -> Self {
+    fn new(
+        shard: &ShardView<'_>,
+        questions: &[Question],
+        (vectors, places): (&[Vector], &[Vec<usize>]),
+        precision: Precision,
+    ) -> Self {
         let instructions = InstructionSet::widest();
         let are_codes_read = match precision {
             Precision::Centroids => false,
@@ -190,15 +195,19 @@ impl ShardScores {
         let projections: Vec<Projection> = vectors.iter().map(project).collect();
         let centroids: Vec<Vec<f32>> =
             projections.iter().map(|of| of.score_centroids(instructions, shard)).collect();
-        let combined = places.iter().map(|places| {
+        let combined = questions.iter().zip(places).map(|(question, places)| {
             let own = centroids[places[0]].iter().enumerate();
-            own.map(|(at, own)| combine(*own, places[1..].iter().map(|n| centroids[*n][at]))).collect()
+            let of = |(at, own): (usize, &f32)| {
+                combine(*own, places[1..].iter().map(|n| centroids[*n][at]), question.least)
+            };
+            own.map(of).collect()
         });
         Self { combined: combined.collect(), projections, centroids }
     }
 }
 
-/// Returns a product minus the largest of its negatives' products. Never -0, which would sort after 0.
-pub(super) fn combine(own: f32, negatives: impl Iterator<Item = f32>) -> f32 {
-    negatives.reduce(f32::max).map_or(own, |worst| own - worst) + 0.0
+/// Returns a product minus the largest of its negatives' products, if any, or `least` if they are less. Never -0, which
+/// would sort after 0.
+pub(super) fn combine(own: f32, negatives: impl Iterator<Item = f32>, least: f32) -> f32 {
+    negatives.reduce(f32::max).map_or(own, |worst| own - worst.max(least)) + 0.0
 }

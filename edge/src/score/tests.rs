@@ -48,7 +48,7 @@ fn exact_vector() -> impl Strategy<Value = Arc<[f32]>> {
 
 fn exact_question() -> impl Strategy<Value = Question> {
     (exact_vector(), prop::collection::vec(exact_vector(), 0..4))
-        .prop_map(|(vector, negatives)| Question { vector, negatives })
+        .prop_map(|(vector, negatives)| Question { negatives, ..Question::new(vector) })
 }
 
 fn region() -> impl Strategy<Value = Region> {
@@ -225,7 +225,11 @@ fn answers_keep_within_the_stated_bound() {
 
 pub(super) fn random_question(random: &mut Random, dim: usize, n_negatives: usize) -> Question {
     let mut unit = || Arc::from(random.unit_vector(dim));
-    Question { vector: unit(), negatives: (0..n_negatives).map(|_| unit()).collect() }
+    Question {
+        vector: unit(),
+        negatives: (0..n_negatives).map(|_| unit()).collect(),
+        least: f32::NEG_INFINITY,
+    }
 }
 
 fn batch<'a>(shards: &'a [ShardView<'a>], questions: &'a [Question]) -> Result<Vec<Search<'a>>, ScoreError> {
@@ -279,7 +283,7 @@ fn refuses_what_cannot_be_scored() {
     let good = good.build(false);
     let search = |shard: &BuiltShard, query: &[f32], negatives: &[&[f32]]| {
         let negatives = negatives.iter().map(|n| Arc::from(*n)).collect();
-        let questions = [Question::new([1.0, 0.0]), Question { vector: query.into(), negatives }];
+        let questions = [Question::new([1.0, 0.0]), Question { negatives, ..Question::new(query) }];
         let shards = [shard.view()];
         let batch = batch(&shards, &questions).map(|_| ()).err();
         let alone = Search::new(&shards, &questions[1], Region::default(), Precision::Exact);

@@ -95,7 +95,10 @@ impl CheckView {
         {
             return on_black_db;
         }
-        let filled = |pixel, c| if is_bare(pixel) { behind[c] } else { drawn(pixel, c) };
+        let filled = |pixel: usize, c: usize| match is_bare(pixel) {
+            true => behind[c],
+            false => drawn(pixel, c) + (1.0 - drawing.coverage[pixel]) * behind[c],
+        };
         on_black_db.max(self.psnr_db(filled))
     }
 

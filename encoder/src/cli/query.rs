@@ -102,7 +102,7 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
     let things = if lists { Things::open(&reader, |_| {})? } else { Things::default() };
     let least = args.threshold.unwrap_or_else(|| things.threshold(manifest, false));
-    let things = things.matching(&[vector], least, n_listed);
+    let things = things.matching(&[vector], (least, least), n_listed);
     let mut lines = asked_as.as_ref().map_or(String::new(), |asked| format!("{words}: asked as {asked}\n"));
     lines.extend(things.iter().map(of_thing));
     lines += &format!("{n_matching} of {n_scored} Gaussians reach {threshold:.3}\n");

@@ -18,7 +18,8 @@ use super::error::EncodeError;
 use super::report::SkippedView;
 use super::settings::{EncodeSettings, InputSettings, MAX_RASTER_WIDTH_PX, ViewSettings};
 use crate::cells::{self, CellSplit, PositionError};
-use crate::ground::Standing;
+use crate::ground::up::{Sign, Up};
+use crate::ground::{Standing, up_by};
 use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{RasterView, check_near_plane};
 use crate::segment::Segmenter;
@@ -98,11 +99,33 @@ impl Inputs {
             );
             return Err(EncodeError::Setting { setting: "--position-error".into(), problem });
         }
-        let stands = || context.install(|| Standing::find(&scene, &views));
-        let standing = Arc::new(context.time("ground", stands));
+        let stands = || {
+            let up = up_by(&scene, &views);
+            if settings.inputs.metric || geo_reference.is_some() {
+                check_up(&up);
+            }
+            Standing::below(&scene, up.axis)
+        };
+        let standing = Arc::new(context.time("ground", || context.install(stands)));
         Ok(Self { scene, split, standing, views, missing, geo_reference })
     }
 }
+
+/// Warns of a scene with metres and z up whose surfaces say otherwise.
+fn check_up(&Up { axis, sign }: &Up) {
+    if sign <= Sign::Unknown && axis.z < LEAST_UP_Z {
+        tracing::warn!(
+            "metres are stated, with z up, but floors and photos say that up is ({:.2}, {:.2}, {:.2}): robots would find no ground; \
+             turn poses and splat, or leave out --metric and the geo-reference",
+            axis.x,
+            axis.y,
+            axis.z
+        );
+    }
+}
+
+/// Cosine of the angle from z at which surfaces are no ground: 30 degrees, beyond any slope that robots drive on.
+const LEAST_UP_Z: f64 = 0.866;
 
 fn check_cells(n: usize) -> Result<(), EncodeError> {
     if n <= cells::MAX_CELLS {

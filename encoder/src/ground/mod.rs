@@ -7,4 +7,4 @@ mod height;
 mod standing;
 pub(crate) mod up;
 
-pub(crate) use standing::{Footprint, NO_THING, Standing, reserve};
+pub(crate) use standing::{Footprint, NO_THING, Standing, reserve, up_by};

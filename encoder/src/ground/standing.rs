@@ -7,7 +7,7 @@ use slag_math::stats::median;
 use slag_math::union_find::UnionFind;
 
 use super::height::Ground;
-use super::up;
+use super::up::{self, Up};
 use crate::memory::{MemoryPlan, Phase};
 
 pub(crate) const NO_THING: u32 = u32::MAX;
@@ -86,9 +86,12 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
 }
 
 impl Standing {
-    /// Assumes that most `views` have the sky above them or the ground before them.
     pub(crate) fn find(scene: &Gaussians, views: &[View]) -> Self {
-        Self(Things::find(scene, up_by(scene, views)))
+        Self::below(scene, up_by(scene, views).axis)
+    }
+
+    pub(crate) fn below(scene: &Gaussians, up_in_world: DVec3) -> Self {
+        Self(Things::find(scene, up_in_world))
     }
 
     pub(crate) fn is_empty(&self) -> bool {
@@ -276,14 +279,15 @@ fn steps() -> impl Iterator<Item = u64> {
     [x, y, z, x + y, x - y, x + z, x - z, y + z, y - z].into_iter()
 }
 
-/// Unit vector. The Gaussians determine the axis, the views its sign: they have up above or the ground before them.
-fn up_by(scene: &Gaussians, views: &[View]) -> DVec3 {
-    let axis = up::find(scene, &up::solid(scene)).axis;
+/// The upward direction. The Gaussians determine the axis, the views its sign: most have the sky above them or the ground
+/// before them.
+pub(crate) fn up_by(scene: &Gaussians, views: &[View]) -> Up {
+    let Up { axis, sign } = up::find(scene, &up::solid(scene));
     let away = |view: &View| {
         let world_from_camera = view.camera_from_world.inverse().matrix3;
         -(world_from_camera.y_axis + world_from_camera.z_axis).dot(axis)
     };
-    if views.iter().map(away).sum::<f64>() < 0.0 { -axis } else { axis }
+    Up { axis: if views.iter().map(away).sum::<f64>() < 0.0 { -axis } else { axis }, sign }
 }
 
 #[cfg(test)]

@@ -111,8 +111,8 @@ impl Things {
         vectors: &[Vec<f32>],
         limit: usize,
     ) -> Value {
-        let threshold = self.threshold(manifest, vectors.len() > 1);
-        let found = self.matching(vectors, threshold, limit);
+        let [plain, threshold] = [false, vectors.len() > 1].map(|with| self.threshold(manifest, with));
+        let found = self.matching(vectors, (plain, threshold), limit);
         let answers: Vec<Value> =
             found.iter().zip(1..).map(|(found, rank)| found.answer(manifest, rank)).collect();
         let none = answers.is_empty().then(|| {
@@ -130,14 +130,19 @@ impl Things {
         }] })
     }
 
-    /// Things at or above a score, best first.
-    pub(crate) fn matching(&self, vectors: &[Vec<f32>], threshold: f32, limit: usize) -> Vec<Found> {
+    /// Things at or above a threshold, best first; negatives score at least `least`, so that they add no answer.
+    pub(crate) fn matching(
+        &self,
+        vectors: &[Vec<f32>],
+        (least, threshold): (f32, f32),
+        limit: usize,
+    ) -> Vec<Found> {
         let mut found: Vec<Found> = Vec::new();
         for ThingsHere { shard, numbers, have_thumbnails } in &self.shards {
             let Some(objects) = shard.objects() else { continue };
             let view = shard.view();
             let scores =
-                combined(vectors.iter().map(|vector| view.object_scores(&objects, vector)).collect());
+                combined(vectors.iter().map(|vector| view.object_scores(&objects, vector)).collect(), least);
             let matching = numbers.iter().filter(|at| scores[**at] >= threshold);
             found.extend(matching.map(|at| {
                 let record = objects.records[*at];

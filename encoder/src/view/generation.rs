@@ -120,7 +120,10 @@ impl Generation {
             Scored::Fields(table, fields) => {
                 let of_regions: Vec<Vec<f32>> = vectors.iter().map(|vector| table.scores(vector)).collect();
                 let scores = |field: &CellField| {
-                    combined(of_regions.iter().map(|of_regions| field.cosines(of_regions)).collect())
+                    combined(
+                        of_regions.iter().map(|of_regions| field.cosines(of_regions)).collect(),
+                        f32::NEG_INFINITY,
+                    )
                 };
                 fields.iter().map(scores).collect()
             }

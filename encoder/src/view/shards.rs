@@ -16,7 +16,8 @@ pub(super) fn photos_of(shard: &StoredShard) -> Vec<Photo> {
 /// Score of each Gaussian's centroid; NaN without one.
 pub(super) fn scores_of(shard: &StoredShard, vectors: &[Vec<f32>]) -> Vec<f32> {
     let view = shard.view();
-    let of_centroids = combined(vectors.iter().map(|vector| view.centroid_scores(vector)).collect());
+    let of_centroids =
+        combined(vectors.iter().map(|vector| view.centroid_scores(vector)).collect(), f32::NEG_INFINITY);
     let mut scores = vec![f32::NAN; view.header.n_gaussians as usize];
     for (centroid, score) in of_centroids.iter().enumerate() {
         scores[view.members(centroid)].fill(*score);
@@ -24,13 +25,13 @@ pub(super) fn scores_of(shard: &StoredShard, vectors: &[Vec<f32>]) -> Vec<f32> {
     scores
 }
 
-/// Combines a question's scores with its negatives' into the relevancy (LERF, Kerr et al. 2023, section 3.3); without
-/// negatives, the question's own.
-pub(super) fn combined(mut of_vectors: Vec<Vec<f32>>) -> Vec<f32> {
+/// Combines a question's scores with its negatives', which are at least `least`, into the relevancy (LERF, Kerr et al.
+/// 2023, section 3.3); without negatives, the question's own.
+pub(super) fn combined(mut of_vectors: Vec<Vec<f32>>, least: f32) -> Vec<f32> {
     let mut own = of_vectors.swap_remove(0);
     if !of_vectors.is_empty() {
         for (k, score) in own.iter_mut().enumerate() {
-            let closest = of_vectors.iter().map(|of| of[k]).fold(f32::NEG_INFINITY, f32::max);
+            let closest = of_vectors.iter().map(|of| of[k]).fold(least, f32::max);
             *score = if score.is_nan() { f32::NAN } else { relevancy(*score - closest) };
         }
     }

@@ -165,6 +165,8 @@ async fn relations_are_answered_and_say_what_failed() {
         ("2nd 0 from the 1", vec![MUG_ON_FLOOR], None),
         ("3rd 0 from the 1", vec![], Some(("too-few", "0"))),
         ("nearest 0", vec![MUG_ON_FLOOR], None),
+        ("what is on the 1", vec![MUG_ON_TABLE], None),
+        ("nearest thing", vec![MUG_ON_FLOOR], None),
         ("0 in front of the 1", vec![MUG_ON_FLOOR], None),
         ("0 behind the 1", vec![], Some(("no-such-pair", "0"))),
     ];
@@ -240,6 +242,7 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({}), "texts"),
         (json!({"texts": vec!["0"; 33]}), "texts"),
         (json!({"texts": ["0"], "colour": 1}), "body"),
+        (json!({"texts": ["anything near something"]}), "phrases"),
         (json!({"texts": "0"}), "body"),
         (json!({"vectors": [[1.0, 0.0]]}), "vectors"),
         (json!({"vectors": [[0.0, 0.0, 0.0]]}), "vectors"),

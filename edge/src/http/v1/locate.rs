@@ -30,8 +30,8 @@ pub struct LocateParams {
     /// Principal point, pixels from the left and the top; by default the middle of the photo.
     #[schemars(example = &"320,240")]
     centre_px: Option<XyText>,
-    /// Direction of gravity in the camera's frame (x right, y down, z forward), as an IMU measures it: poses that
-    /// contradict it are refused.
+    /// Direction of gravity in the camera's frame (x right, y down, z forward), opposite to what an accelerometer at rest
+    /// measures: poses that contradict it are refused.
     #[schemars(example = &"0,1,0")]
     gravity: Option<XyzText>,
     /// With sigma: where the robot may be; poses elsewhere are refused.

@@ -157,6 +157,14 @@ fn objects_abstain_and_keep_to_the_region() {
     let found = clusters(&answers[0]);
     let expected = crate::score::relevancy(0.8 - 0.9);
     assert!(found.len() == 1 && (found[0].score - expected).abs() < 0.01, "{found:?}");
+    // Negatives add no answer, however far from them a thing is: 21 has 0.8, 22 has 0.
+    for (threshold, expected) in [(None, 1), (Some(0.4), 2)] {
+        let question = Question { negatives: vec![[0.0f32, -1.0].into()], ..Question::new([1.0, 0.0]) };
+        let answers = ask_about(&scene, &[question], |request, _| {
+            (request.negatives, request.threshold) = (Negatives(vec!["other".into()]), threshold);
+        });
+        assert_eq!(clusters(&answers[0]).len(), expected, "{threshold:?}");
+    }
     // A scene without objects reports that.
     let answers = ask(&yard(), |request, _| request.kind = Some(AnswerKind::Objects));
     assert!(answers.reason.is_some_and(|r| r.detail.contains("kind=clusters")));
