@@ -242,7 +242,7 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({}), "texts"),
         (json!({"texts": vec!["0"; 33]}), "texts"),
         (json!({"texts": ["0"], "colour": 1}), "body"),
-        (json!({"texts": ["anything near something"]}), "phrases"),
+        (json!({"texts": ["anything near something"]}), "texts"),
         (json!({"texts": "0"}), "body"),
         (json!({"vectors": [[1.0, 0.0]]}), "vectors"),
         (json!({"vectors": [[0.0, 0.0, 0.0]]}), "vectors"),

@@ -153,8 +153,10 @@ fn edges(of: &[DVec2]) -> impl Iterator<Item = (DVec2, DVec2)> {
     (0..of.len()).map(move |at| (of[at], of[(at + 1) % of.len()]))
 }
 
+/// Whether an outline with an area contains a point; the asker's outline has none.
 fn contains(of: &[DVec2], point: DVec2) -> bool {
-    edges(of).all(|(from, to)| (to - from).perp_dot(point - from) >= 0.0)
+    edges(of).map(|(p, q)| p.perp_dot(q)).sum::<f64>() > 0.0
+        && edges(of).all(|(from, to)| (to - from).perp_dot(point - from) >= 0.0)
 }
 
 fn between_segments(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> f64 {

@@ -97,6 +97,15 @@ fn the_asker_has_a_left_and_a_front() {
             assert_eq!(degree >= HOLDS, is == other, "{other} {x} {y}: {degree}");
         }
     }
+    // By hand: 2 m less half of the thing, in any direction; the asker has no extent.
+    for (x, y) in [(2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)] {
+        assert!(
+            (at(x, y).gap(&me) - 1.85).abs() < 0.01 && (me.gap(&at(x, y)) - 1.85).abs() < 0.01,
+            "{x} {y}"
+        );
+        assert_eq!(degree(Relation::Near, &at(x, y), &me, Some(&viewer), METRES), 0.0);
+    }
+    assert_eq!(at(0.1, 0.1).gap(&me), 0.15, "above the asker");
     let blind = Viewer { heading_rad: None, ..viewer };
     assert_eq!(degree(Relation::LeftOf, &at(-2.0, 0.0), &me, Some(&blind), METRES), 0.0);
 }
