@@ -1,11 +1,4 @@
-//! The words of a question, prepared for a text model.
-
-use crate::{InferenceError, KnownPhrases};
-
-/// Words that name nothing to find: alone, a text model would answer them with the nearest object.
-const NAMELESS: &str = "a all an and any are at behind beneath between biggest bring by closest farthest fifth find first for fourth \
-    from furthest go here i in is it largest littlest look me my near nearest next no not of on one or over please second show \
-    smallest some take that the there these third this to under us what what's where where's which with your you";
+//! Words of texts, and lists of what people ask for.
 
 /// Returns the words of a text: letters, digits and apostrophes, with hyphens between them and points between digits.
 pub fn words(text: &str) -> Vec<String> {
@@ -32,19 +25,6 @@ pub fn words(text: &str) -> Vec<String> {
     words.filter(|word| !word.is_empty()).map(str::to_owned).collect()
 }
 
-/// Returns the words of a text, separated by a space. Refuses a text without a word that can name something, and one
-/// that names several of the `known` phrases.
-pub fn words_to_find(text: &str, known: Option<&KnownPhrases>) -> Result<String, InferenceError> {
-    known.map_or(Ok(()), |known| known.check_one(text))?;
-    let words = words(text);
-    let is_nameless =
-        |word: &String| NAMELESS.split_whitespace().any(|nameless| word.eq_ignore_ascii_case(nameless));
-    match words.iter().all(is_nameless) {
-        true => Err(InferenceError::EmptyText),
-        false => Ok(words.join(" ")),
-    }
-}
-
 /// Phrases as people ask them, one per line.
 const TEXTS: &str = include_str!("everyday.txt");
 /// Nouns of objects, one per line, sorted.
@@ -64,29 +44,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn signs_count_for_nothing() {
-        for text in
-            ["chair", " chair ?", "\"chair\"", "🪑 chair", "ch\u{200d}air", "\u{202e}chair", "(chair).."]
-        {
-            assert_eq!(words_to_find(text, None).expect(text), "chair");
-        }
-        assert_eq!(
-            words_to_find("a man’s T-shirt, size 3.5", None).expect("named"),
-            "a man's T-shirt size 3.5"
-        );
-        assert_eq!(words_to_find("so\u{ad}fa🪑ch\u{200b}air", None).expect("named"), "sofa chair");
+    fn words_have_letters_and_hyphens() {
         let found = words("bottle… (on-the) ‘table’/coffee_mug -");
         assert_eq!(found, ["bottle", "on-the", "table", "coffee", "mug"]);
-        assert_eq!(words_to_find("чашка на столе", None).expect("named"), "чашка на столе");
-    }
-
-    #[test]
-    fn a_text_that_names_nothing_is_refused() {
-        let empty =
-            "|?|%|..|!!!|\"|🪑🪑|\u{200b}|the|An ?|a the|of|is|Where is the|find|go to|the largest|second|on";
-        for text in empty.split('|') {
-            assert!(matches!(words_to_find(text, None), Err(InferenceError::EmptyText)), "{text}");
-        }
     }
 
     #[test]
