@@ -6,11 +6,12 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use slag_common::{Similarity, View};
 
 use super::mistake::AlignError;
+use super::view::CheckView;
 use super::{
     FrameCause, Mistake, Suspicion, ViewCheck, align, mark_far_below, means_of, nerfstudio_defaults,
     suspicions,
 };
-use crate::raster::{RasterView, pinhole};
+use crate::raster::{Drawing, RasterView, pinhole};
 
 fn view(name: &str, world_from_camera: DAffine3) -> View {
     View {
@@ -206,6 +207,30 @@ fn what_drawings_do_not_confirm_is_no_advice() {
 }
 
 /// Ten Gaussians, where the cameras are.
+/// Trainers of single things put them on white: so must drawings be, where a splat is translucent as where it is not.
+#[test]
+fn a_photo_on_white_is_like_its_drawing_on_black() {
+    let coverage: Vec<f32> =
+        (0..64).map(|pixel| [0.0, 0.0, 0.0, 0.0, 0.6, 0.7, 0.8, 1.0][pixel % 8]).collect();
+    let rgb = coverage.iter().flat_map(|share| [0.8, 0.2, 0.1].map(|c| c * share)).collect();
+    let on_white =
+        |pixel: usize, c: f32| (255.0 * (c * coverage[pixel] + 1.0 - coverage[pixel])).round() as u8;
+    let photo = (0..64).flat_map(|pixel| [0.8, 0.2, 0.1].map(|c| on_white(pixel, c))).collect();
+    let image = image::RgbImage::from_raw(8, 8, photo).expect("8 x 8");
+    let raster_view = RasterView { camera_from_world: DAffine3::IDENTITY, intrinsics: pinhole([8, 8], 8.0) };
+    let view = CheckView { name: "a".to_owned(), image, valid: None, view: raster_view };
+    let drawing = Drawing {
+        width_px: 8,
+        height_px: 8,
+        rgb,
+        depth: vec![1.0; 64],
+        coverage,
+        counters: Default::default(),
+    };
+    let db = view.likeness_db(&drawing);
+    assert!(db > 45.0, "{db}");
+}
+
 fn scene_of(views: &[View]) -> slag_common::Gaussians {
     let scene = slag_common::Gaussians::balls(views.iter().map(View::position_in_world).collect(), 0.1);
     scene.select(&[0, 1, 2, 3, 4, 5, 0, 1, 2, 3])
