@@ -288,3 +288,22 @@ test("the robot is named, with its age and heading; a lost service has a badge; 
   service.behaviour.isGone = true;
   await page.locator("#badge").getByText("offline").waitFor({ timeout: 15000 });
 }, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}`, expected: /ERR_/ }));
+
+test("a clicked object that answers the question is that answer; another has no score, and Esc brings the answers back", () => opened(async (page) => {
+  await drawn(page);
+  await answered(page, "chair");
+  const clickAt = async (point, ...camera) => page.mouse.click(...project(point, ...camera));
+  const card = page.locator("#answers .card");
+  await clickAt([-1.5, -1.5, 0.5]);
+  await card.getByText("ball").waitFor();
+  assert.doesNotMatch(await page.locator("#answers").innerText(), /Score|weak/);
+  const ofBall = await cameraOf(page);
+  await page.keyboard.press("Escape");
+  await card.getByText("strong").waitFor();
+  assert.equal(await page.locator("#message").innerText(), "1 found");
+  await clickAt([-1.5, -1, 0.95], ...ofBall);
+  await card.getByText("ball").waitFor();
+  await clickAt([1.2, 0.8, 0.9], ...ofBall);
+  await page.locator("#answers .chosen").getByText("strong").waitFor();
+  assert.match(await page.locator("#details").innerText(), /Score/);
+}, { behaviour: { goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));

@@ -61,6 +61,8 @@ export class Asking {
   private answers: Answer[] = [];
   private asked: Asked | null = null;
   private chosen: number | null = null;
+  /** What the questions found last. */
+  private found: [Found | null, Found | null] = [null, null];
   private controller = new AbortController();
   private photoOpened = 0;
 
@@ -158,6 +160,7 @@ export class Asking {
 
   /** Lights only what was found: nothing is lit beside the words "not found". */
   private show(first: Found | null, beside: Found | null): void {
+    this.found = [first, beside];
     const lit = (found: Found | null) => (found && found.reply.answers.length > 0 ? found : null);
     this.scores = lit(first)?.scores ?? null;
     const second = lit(beside);
@@ -190,6 +193,8 @@ export class Asking {
 
   choose(index: number | null): void {
     const { asked } = this;
+    // The answers come back after an object that was clicked, not asked for.
+    if (index === null && asked?.query === "") return this.show(...this.found);
     this.chosen = index !== null && index < this.answers.length ? index : null;
     const opacities = this.answers.map((answer) => OPACITY[strengthOf(answer, asked?.threshold ?? null)]);
     this.drawing.showAnswers(asked?.thing ?? "", this.answers, opacities, this.chosen);
@@ -205,8 +210,11 @@ export class Asking {
     if (photo >= 0) void this.openPhoto(photo, answer.evidence?.box_px ?? null);
   }
 
-  /** Shows one object that was clicked, as if it had been asked for. */
+  /** Shows an object that was clicked: as the answer that it is, or else alone, without a score. */
   showObject(object: Answer): void {
+    this.choose(null);
+    const index = this.answers.findIndex(({ id }) => id === object.id);
+    if (index >= 0) return this.choose(index);
     this.answers = [{ ...object, score: object.score ?? 0 }];
     this.asked = { thing: object.names?.[0]?.name ?? "Unnamed object", query: "", threshold: null, viewpoint: this.viewpoint(), description: this.description() };
     showCards(this.answers, this.asked, (index) => this.choose(index === this.chosen ? null : index));

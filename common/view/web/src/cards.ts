@@ -54,8 +54,12 @@ export function showCards(answers: Answer[], asked: Asked, onChoose: (index: num
     const text = make("span");
     const { metric } = asked.description;
     text.append(make("b", asked.thing), make("small", whereabouts(answer.position_in_world, asked.viewpoint, metric), "where"), make("small", sizeText(answer, metric)));
-    const strength = strengthOf(answer, asked.threshold);
-    card.append(frame, text, make("span", strength, `strength ${strength}`));
+    card.append(frame, text);
+    // An object that was clicked has no score.
+    if (asked.query) {
+      const strength = strengthOf(answer, asked.threshold);
+      card.append(make("span", strength, `strength ${strength}`));
+    }
     const item = make("li");
     item.append(card);
     pictureOf(answer, asked.description)?.then((picture) => frame.prepend(picture), () => {});
@@ -86,13 +90,13 @@ export function openCard(answers: Answer[], chosen: number | null, asked: Asked,
   item.scrollIntoView({ block: "nearest" });
 }
 
-function facts(answer: Answer, { description, threshold }: Asked): HTMLDListElement {
+function facts(answer: Answer, { description, query, threshold }: Asked): HTMLDListElement {
   const rows: [string, string][] = [[description.geographic ? "East, north, up" : "Position", metres(answer.position_in_world)]];
   if (answer.geographic) {
     const { latitude_deg, longitude_deg, height_m } = answer.geographic;
     rows.push(["Lat, lon", `${latitude_deg.toFixed(7)}, ${longitude_deg.toFixed(7)}`], ["Height", `${height_m.toFixed(2)} m`]);
   }
-  rows.push(["Score", `${answer.score.toFixed(2)}${threshold === null ? "" : `, found from ${threshold.toFixed(2)}`}`]);
+  if (query) rows.push(["Score", `${answer.score.toFixed(2)}${threshold === null ? "" : `, found from ${threshold.toFixed(2)}`}`]);
   if (answer.names?.length) rows.push(["Names", answer.names.map(({ name, confidence }) => `${name} ${Math.round(confidence * 100)} %`).join(", ")]);
   if (!isObject(answer)) rows.push(["Kind", "a group of points, not a marked object"]);
   if (answer.degree !== undefined) rows.push(["Relation", `holds to ${answer.degree.toFixed(2)}`]);
