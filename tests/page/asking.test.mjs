@@ -85,8 +85,13 @@ test("a click chooses a suggestion, and a second question has its own", () => op
   await page.locator("#second-suggestions").getByText("ball").click();
   await answered(page, "ball");
   assert.ok(await page.locator("#question-suggestions").isHidden());
-  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=ball"));
-}));
+  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=ball"));  // One that is refused leaves the other's answers.
+  await page.fill("#question", "chair");
+  await answered(page, "chair | ball");
+  await page.fill("#second", "bal");
+  await page.locator("#second-legend").getByText("is not one of").waitFor();
+  assert.equal(await page.locator("#answers .card").count(), 1);
+}, { behaviour: { refused: { text: "bal", detail: '"bal" is not one of the 5 phrases this model knows; did you mean ball, wall?' } }, expected: /422/ }));
 
 // For a model that takes any text, everyday words are counted, some at a time.
 test("things on board are suggested of a model without a list of words, as they are counted", () => opened(async (page, service) => {

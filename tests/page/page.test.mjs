@@ -121,7 +121,10 @@ test("a lost service and another generation are told", () => opened(async (page,
   await drawn(page);
   service.behaviour.isGone = true;
   await page.getByText("cannot be reached").waitFor({ timeout: 15000 });
+  await page.fill("#question", "chair");
+  await page.waitForTimeout(500);
   service.behaviour.isGone = false;
+  await answered(page, "chair");
   service.behaviour.generation = 2;
   await page.getByText("generation 2 now").waitFor({ timeout: 15000 });
   await drawn(page);

@@ -91,7 +91,7 @@ function scoresMessage(things, text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", id: "o1", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", id: "o1", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, refused: null, ageSecs: 7200, ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -114,6 +114,7 @@ export async function startService(behaviour = {}) {
     if (foreign) return json(response, 400, { detail: `unknown parameter ${foreign}` });
     const cell = url.pathname.match(/^\/v1\/view\/cells\/(\d+)$/);
     if (cell) return response.writeHead(200).end(cellMessage(behaviour.things[Number(cell[1])], Number(url.searchParams.get("step") ?? 1)));
+    if (behaviour.refused && /query|scores/.test(url.pathname) && url.searchParams.get("text") === behaviour.refused.text) return json(response, 422, { detail: behaviour.refused.detail });
     if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(behaviour.things, url.searchParams.get("text").replace("seat", "chair"), behaviour.generation));
     if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: behaviour.words, complete: behaviour.hasAllWords });
     if (url.pathname === "/v1/map") return json(response, 200, { age_secs: behaviour.ageSecs, is_expired: false });

@@ -6,7 +6,7 @@ import { clustersOf, topScore, voxelOf } from "./clusters";
 import type { Question } from "./drawing/cells";
 import type { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, parseQuestion, type Photo } from "./network";
+import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, Offline, parseQuestion, type Photo } from "./network";
 import { offer, panel, say, showLegend, showSecond } from "./panel";
 import { pictureOf } from "./photos";
 import type { PlacesToStand } from "./places";
@@ -65,10 +65,12 @@ export class Asking {
   private found: [Found | null, Found | null] = [null, null];
   private controller = new AbortController();
   private photoOpened = 0;
+  /** Whether the service was gone when it was asked last. */
+  isCutOff = false;
 
   /** `viewpoint` is from where distances are said now; `onOther` is called when the service has another generation. */
   constructor(private readonly state: State, private readonly drawing: Drawing, private readonly places: PlacesToStand,
-    private readonly description: () => Description, private readonly viewpoint: (ofCamera?: boolean) => Viewpoint, private readonly onOther: () => void, private readonly report: (error: unknown) => void) {}
+    private readonly description: () => Description, private readonly viewpoint: (ofCamera?: boolean) => Viewpoint, private readonly onOther: () => void, private readonly report: (error: unknown, tell?: (text: string, isError?: boolean) => void) => void) {}
 
   /** `outside`: the level from which Gaussians outside of the things are lit. */
   colour(level: number, outside = level, answers: Answer[] = []): void {
@@ -141,21 +143,24 @@ export class Asking {
     this.controller.abort();
     this.controller = new AbortController();
     const { signal } = this.controller;
+    this.isCutOff = false;
     writeState(state);
-    try {
-      const [first, beside] = await Promise.all([this.fetchBoth(state.question, signal), this.fetchBoth(state.second, signal)]);
-      if (signal.aborted) return;
-      // Scores of another generation would light the wrong Gaussians; the next poll brings both.
-      if ([first, beside].some((found) => found && found.scores.generation !== this.description().generation % 2 ** 32)) return this.onOther();
-      this.show(first, beside);
-      this.drawing.onceDrawn(() => performance.measure("answered", { start }));
-      if (first) remember(state.question);
-      document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
-    } catch (error) {
-      if (signal.aborted) return;
-      this.show(null, null);
-      this.report(error);
-    }
+    const [first, beside] = await Promise.allSettled([state.question, state.second].map((line) => this.fetchBoth(line, signal)));
+    if (signal.aborted) return;
+    const found = [first, beside].map((asked) => (asked.status === "fulfilled" ? asked.value : null));
+    // Scores of another generation would light the wrong Gaussians; the next poll brings both.
+    if (found.some((one) => one && one.scores.generation !== this.description().generation % 2 ** 32)) return this.onOther();
+    this.show(found[0], found[1]);
+    this.drawing.onceDrawn(() => performance.measure("answered", { start }));
+    if (found[0]) remember(state.question);
+    if (first.status === "rejected") this.fail(first.reason, say);
+    else if (beside.status === "rejected") this.fail(beside.reason, showSecond);
+    else document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
+  }
+
+  private fail(error: unknown, tell: (text: string, isError?: boolean) => void): void {
+    this.isCutOff = error instanceof Offline;
+    this.report(error, tell);
   }
 
   /** Lights only what was found: nothing is lit beside the words "not found". */

@@ -47,12 +47,12 @@ async function withToken<T>(request: () => Promise<T>): Promise<T> {
   }
 }
 
-function report(error: unknown): void {
+function report(error: unknown, tell = say): void {
   if (error instanceof Unauthorized) {
     void withToken(describe).then(() => asking.ask());
     return;
   }
-  say(error instanceof Error ? error.message : String(error), true);
+  tell(error instanceof Error ? error.message : String(error), true);
 }
 
 /** Distances are from the robot, or where none is from the camera. */
@@ -162,6 +162,7 @@ async function look(): Promise<void> {
       streaming.update();
       if (!hasAllWords) void learnWords();
       if (wasOffline) say("The service is back.");
+      if (asking.isCutOff) await asking.ask();
     }
   } catch (error) {
     document.documentElement.dataset.offline = "";
