@@ -46,14 +46,15 @@ test("typing asks after a pause, the slider unlights, a click shows the thing, a
   await page.getByText("nothing found").waitFor();
 }, { isLookedAt: true, behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
 
-test("negatives go to the service", () => opened(async (page, service) => {
+test("negatives go to the service, and there may be more answers than are shown", () => opened(async (page, service) => {
   await drawn(page);
   await page.fill("#question", "chair -wall -floor");
   await answered(page, "chair -wall -floor");
-  for (const path of ["/v1/view/scores?text=chair&negative=wall&negative=floor", "/v1/query?text=chair&negative=wall&negative=floor&limit=20"]) {
+  for (const path of ["/v1/view/scores?text=chair&negative=wall&negative=floor", "/v1/query?text=chair&negative=wall&negative=floor&limit=21"]) {
     assert.ok(service.behaviour.requests.includes(path), path);
   }
-}));
+  assert.deepEqual([await page.locator("#message").innerText(), await page.locator("#answers .card").count()], ["20+ found", 20]);
+}, { behaviour: { nAnswers: 25 } }));
 
 test("a phrase lights its thing and tells what it is related to", () => opened(async (page) => {
   await drawn(page);

@@ -91,7 +91,7 @@ function scoresMessage(things, text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", id: "o1", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, refused: null, ageSecs: 7200, ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", id: "o1", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, refused: null, nAnswers: 1, ageSecs: 7200, ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -141,13 +141,13 @@ export async function startService(behaviour = {}) {
       const [name, support] = url.searchParams.get("text").replace(" near me", "").split(" on the ");
       const thing = behaviour.known.find((entry) => entry.name === name);
       const understood = support ? { thing: name, relation: { is: "on", of: { thing: support } } } : null;
-      const answers = thing ? [{
+      const answers = thing ? Array(Math.min(behaviour.nAnswers, Number(url.searchParams.get("limit")))).fill({
         ...(support ? { degree: 0.93, related_to: [{ thing: support, position_in_world: [0, 0, 0], score: 0.7 }] } : {}),
         geographic: { latitude_deg: 48.1, longitude_deg: 11.5, height_m: 520 },
         ...(behaviour.evidence ? { evidence: behaviour.evidence } : {}),
         id: behaviour.id, score: 0.86, n_gaussians: 1536, position_in_world: thing.min.map((low, i) => (low + thing.max[i]) / 2),
         box_min_in_world: thing.min, box_max_in_world: thing.max,
-      }] : [];
+      }) : [];
       const none = thing ? null : behaviour.none ?? { kind: "nothing-there", detail: "nothing found", thing: null };
       const thresholds = support ? { parts: [{ thing: name, n_found: 1, threshold: 0.5 }] } : { threshold: behaviour.threshold };
       return json(response, 200, { results: [{ question: {}, understood, answers, none, ...thresholds }] });

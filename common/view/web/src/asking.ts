@@ -6,7 +6,7 @@ import { clustersOf, topScore, voxelOf } from "./clusters";
 import type { Question } from "./drawing/cells";
 import type { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, Offline, parseQuestion, type Photo } from "./network";
+import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, MAX_ANSWERS, Offline, parseQuestion, type Photo } from "./network";
 import { offer, panel, say, showLegend, showSecond } from "./panel";
 import { pictureOf } from "./photos";
 import type { PlacesToStand } from "./places";
@@ -42,6 +42,9 @@ function noneText({ thing, best, isOfPoints, threshold, none, isBelowThreshold, 
   }
   return `Not found. ${(none ?? "").replace(/\d+\.\d{4,}/g, (number) => Number(number).toFixed(3))}`;
 }
+
+const countText = ({ answers, hasMore }: Answers) => (hasMore ? `${answers.length}+` : String(answers.length || "not"));
+const shortened = (reply: Answers): Answers => ({ ...reply, answers: reply.answers.slice(0, MAX_ANSWERS), hasMore: reply.answers.length > MAX_ANSWERS });
 
 /** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found; outside of answers floors do. */
 function levelsFrom({ scores, reply: { threshold, answers } }: Found): { threshold: number; outside: number; answers: Answer[] } {
@@ -103,7 +106,7 @@ export class Asking {
       // A store's page says no best score of things.
       if (reply.best === null) [reply.best, reply.isOfPoints] = [scores.min + (bestLevel(scores) / 255) * (scores.max - scores.min), true];
     }
-    return { scores, reply };
+    return { scores, reply: shortened(reply) };
   }
 
   private groupsOf(scores: Scores, threshold: number): Answer[] {
@@ -121,7 +124,7 @@ export class Asking {
   private showNearest({ scores, reply }: Found): void {
     const threshold = topScore(this.drawing.cells.all(), scores);
     if (threshold === null) return;
-    this.show({ scores, reply: { ...reply, answers: this.groupsOf(scores, threshold), isNearest: true } }, null);
+    this.show({ scores, reply: shortened({ ...reply, answers: this.groupsOf(scores, threshold), isNearest: true }) }, null);
     this.light(levelOf(threshold, scores));
   }
 
@@ -170,7 +173,7 @@ export class Asking {
     this.scores = lit(first)?.scores ?? null;
     const second = lit(beside);
     this.second = second && { scores: second.scores, ...levelsFrom(second) };
-    showSecond(beside && `${beside.reply.thing}: ${beside.reply.answers.length || "not"} found`);
+    showSecond(beside && `${beside.reply.thing}: ${countText(beside.reply)} found`);
     const { threshold } = this.state;
     const levels = first && levelsFrom(first);
     if (!first || !levels || !this.scores) this.colour(0);
@@ -184,10 +187,10 @@ export class Asking {
     if (!first) return say("");
     const n = this.answers.length;
     const isGroups = n > 0 && this.answers.every(({ id }) => !id);
-    const groups = n === 1 ? "1 place matches, which is not marked as an object." : `${n} places match, none marked as an object.`;
     const { reply } = first;
+    const groups = n === 1 ? "1 place matches, which is not marked as an object." : `${countText(reply)} places match, none marked as an object.`;
     const isUnlike = n === 0 && reply.isPlain && reply.isBelowThreshold;
-    const found = n === 0 ? noneText(reply) : reply.isNearest ? `The nearest to “${reply.thing}”, all below ${reply.threshold?.toFixed(2)}` : isGroups ? groups : `${n} found`;
+    const found = n === 0 ? noneText(reply) : reply.isNearest ? `The nearest to “${reply.thing}”, all below ${reply.threshold?.toFixed(2)}` : isGroups ? groups : `${countText(reply)} found`;
     const askedAs = Object.entries(first.reply.askedAs).map(([word, asked]) => `${word}: asked as ${asked}`);
     const seenFrom = reply.seenFrom ? `seen from ${reply.seenFrom}` : "";
     const isRelation = this.description().program !== "slag-edge" && RELATION.test(parseQuestion(this.state.question).text);

@@ -2,14 +2,13 @@
 
 import { centreOf } from "./drawing/pick";
 import type { CellGaussians, Scores } from "./messages";
-import type { Answer, Description, Vector } from "./network";
+import { type Answer, type Description, MAX_ANSWERS, type Vector } from "./network";
 
 /** The robot's own. */
 const MIN_COUNT = 10;
 const METRIC_VOXEL_M = 0.25;
 /** Along a cell, where units are not metres. */
 const VOXELS_PER_CELL = 64;
-const MAX_CLUSTERS = 20;
 
 interface Voxel {
   points: Vector[];
@@ -79,7 +78,7 @@ export function clustersOf(cells: Iterable<[number, CellGaussians]>, scores: Sco
     }
     if (points.length >= MIN_COUNT) found.push(answerOf(points, sum / points.length));
   }
-  return found.sort((a, b) => b.score * Math.sqrt(b.n_gaussians ?? 0) - a.score * Math.sqrt(a.n_gaussians ?? 0)).slice(0, MAX_CLUSTERS);
+  return found.sort((a, b) => b.score * Math.sqrt(b.n_gaussians ?? 0) - a.score * Math.sqrt(a.n_gaussians ?? 0)).slice(0, MAX_ANSWERS + 1);
 }
 
 function answerOf(points: Vector[], score: number): Answer {

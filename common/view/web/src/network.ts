@@ -107,6 +107,8 @@ export interface Answers {
   /** What was looked for: the question, or the thing of a phrase such as "mug on the table". */
   thing: string;
   answers: Answer[];
+  /** Whether there are more answers than these. */
+  hasMore?: boolean;
   threshold: number | null;
   none: string | null;
   /** Whether they answer words alone: groups of Gaussians may stand in for objects. */
@@ -149,7 +151,8 @@ export class NotFound extends Error {}
 export class Offline extends Error {}
 
 const TOKEN = "slag-token";
-const MAX_ANSWERS = 20;
+/** Answers that are shown. */
+export const MAX_ANSWERS = 20;
 
 export function setToken(token: string): void {
   sessionStorage.setItem(TOKEN, token);
@@ -281,10 +284,11 @@ export async function fetchGoals(id: string, radiusM: number, signal: AbortSigna
 /**
  * The things that answer a question. `askers`: tried in turn where a relation depends on who asks ("chair near me"),
  * and only then: the asker's place changes the order of all answers.
+ * One answer more than are shown tells that there are more.
  */
 export async function fetchAnswers(question: Question, signal: AbortSignal, askers: Asker[]): Promise<Answers> {
   const parameters = parametersOf(question);
-  const ask = async () => (await (await get(`/v1/query?${parameters}&limit=${MAX_ANSWERS}`, signal)).json()).results[0];
+  const ask = async () => (await (await get(`/v1/query?${parameters}&limit=${MAX_ANSWERS + 1}`, signal)).json()).results[0];
   let seenFrom: string | null = null;
   let result;
   for (const left = [...askers]; !result;) {
