@@ -74,6 +74,11 @@ test("keys choose a suggestion, and screen readers are told which", () => opened
   assert.deepEqual(await options.allInnerTexts(), ["chair -ball1"]);
   await page.keyboard.press("Escape");
   assert.deepEqual([await options.count(), await box.inputValue()], [0, "chair -ba"]);
+  // This model lists what it knows, and refuses other phrases.
+  for (const line of ["soft cha", "chair -re"]) {
+    await box.fill(line);
+    assert.equal(await options.count(), 0, line);
+  }
   await box.fill("");
   assert.ok((await options.allInnerTexts()).includes("wallbefore"));
 }));
@@ -91,6 +96,11 @@ test("a click chooses a suggestion, and a second question has its own", () => op
   await page.fill("#second", "bal");
   await page.locator("#second-legend").getByText("is not one of").waitFor();
   assert.equal(await page.locator("#answers .card").count(), 1);
+  // Words that the model knows are a click away.
+  await page.fill("#second", "");
+  await page.fill("#question", "bal -wall");
+  await page.locator("#message").getByRole("button", { name: "ball" }).click();
+  await answered(page, "ball -wall");
 }, { behaviour: { refused: { text: "bal", detail: '"bal" is not one of the 5 phrases this model knows; did you mean ball, wall?' } }, expected: /422/ }));
 
 // For a model that takes any text, everyday words are counted, some at a time.

@@ -156,9 +156,21 @@ export class Asking {
     this.show(found[0], found[1]);
     this.drawing.onceDrawn(() => performance.measure("answered", { start }));
     if (found[0]) remember(state.question);
-    if (first.status === "rejected") this.fail(first.reason, say);
+    if (first.status === "rejected") this.fail(first.reason, (text, isError) => this.sayRefused(text, isError));
     else if (beside.status === "rejected") this.fail(beside.reason, showSecond);
     else document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
+  }
+
+  /** Says why nothing was answered; the words that the service names in place of an unknown one are buttons. */
+  private sayRefused(text: string, isError?: boolean): void {
+    const [, start, unknown, near] = text.match(/^(.*"(.+)" is not one of .*did you mean) (.+)\?$/) ?? [];
+    say(start ?? text, isError);
+    for (const word of near?.split(", ") ?? []) {
+      offer(word, () => {
+        panel.question.value = this.state.question.replace(unknown, word);
+        panel.form.requestSubmit();
+      });
+    }
   }
 
   private fail(error: unknown, tell: (text: string, isError?: boolean) => void): void {

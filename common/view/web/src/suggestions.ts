@@ -16,7 +16,7 @@ export interface Suggestion {
   note: string;
 }
 
-/** Suggests lines of the history that contain the text, and words that complete its last word. */
+/** Suggests lines of the history that contain the text, and words that complete it or, where the model takes any text, its last word. */
 export function suggest(line: string, history: string[], words: Word[]): Suggestion[] {
   const typed = line.trimStart().toLowerCase();
   const found: Suggestion[] = [];
@@ -26,9 +26,10 @@ export function suggest(line: string, history: string[], words: Word[]): Suggest
   };
   const before = history.filter((entry) => entry.toLowerCase().includes(typed.trimEnd()));
   for (const entry of typed ? before : before.slice(0, MAX_HISTORY_AT_FIRST)) add({ line: entry, note: "before" });
-  // `chair -wa` goes on with the negative "wall"; words of the model may hold spaces, so two typed words may
-  // begin one.
-  const [, start, last] = line.match(/^(.*\s-?|-?)(\S*)$/s) ?? ["", "", line];
+  // `chair -wa` goes on with the negative "wall"; words of the model may hold spaces, so two typed words may begin
+  // one. A model that lists words without things knows no others: it refuses a phrase around one of them.
+  const isFixed = words.some(({ n_things }) => n_things === 0);
+  const [, start, last] = line.match(isFixed ? /^(.*\s-|-?)(.*)$/s : /^(.*\s-?|-?)(\S*)$/s) ?? ["", "", line];
   const starts = [{ start: line.startsWith("-") ? "-" : "", part: typed.replace(/^-/, "") }, { start, part: last.toLowerCase() }];
   for (const [matches, isAllowed] of [
     [(word: string, part: string) => word.startsWith(part), true],
@@ -38,7 +39,8 @@ export function suggest(line: string, history: string[], words: Word[]): Suggest
     for (const { start: kept, part } of starts) {
       if (typed && !part) continue;
       for (const { word, n_things } of words) {
-        if (!typed && n_things === 0) continue;
+        // A negative is one word.
+        if ((!typed && n_things === 0) || (kept.endsWith("-") && /\s/.test(word))) continue;
         if (matches(word.toLowerCase(), part)) add({ line: kept + word, note: noteOf(n_things) });
       }
     }
