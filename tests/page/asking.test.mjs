@@ -142,6 +142,18 @@ test("a link shows the same questions, threshold and camera to others", () => op
   await answered(other, "chair | ball");
   assert.deepEqual(await shown(other), first);
   assert.deepEqual(first.slice(0, 3), ["chair", "ball", "200"]);
+  // In the same tab, too; and a question that has stood for a while is a step back.
+  await page.evaluate(() => { location.hash = "q=wall"; });
+  await page.getByText("nothing found").waitFor();
+  await page.goBack();
+  await answered(page, "chair | ball");
+  assert.deepEqual(await shown(page), first);
+  await page.waitForTimeout(2100);
+  await page.fill("#second", "");
+  await page.fill("#question", "ball");
+  await answered(page, "ball");
+  await page.goBack();
+  await answered(page, "chair | ball");
   // Both are lit, each in its own colours.
   for (const [colour, n] of [["(r, g, b) => r > 90 && r - Math.min(g, b) > 45", 2000], ["(r, g, b) => b > 90 && b - r > 45", 2000]]) {
     assert.ok((await pixels(other, PANEL_PX, colour)).length > n, colour);

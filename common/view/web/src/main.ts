@@ -79,14 +79,19 @@ function open(): void {
   new Dropping(drawing, asking, () => description, report);
   panel.locate.hidden = description.program !== "slag-edge";
   panel.form.hidden = !description.can_ask;
-  if (state.camera) drawing.placeAt(state.camera);
   drawing.setTheme(themeNow());
   showRobot();
+  restore();
   stream();
+  if (description.can_ask && (state.question || state.second)) void askOnceDrawn();
+}
+
+/** Shows what the address says, but for answers. */
+function restore(): void {
+  if (state.camera) drawing.placeAt(state.camera);
   panel.question.value = state.question;
   panel.second.value = state.second;
   showBeside(state.second !== "");
-  if (description.can_ask && (state.question || state.second)) void askOnceDrawn();
 }
 
 /** Groups are made of what is drawn. */
@@ -235,6 +240,14 @@ function listen(): void {
     // Browsers give pages a clipboard over HTTPS and on this machine only.
     const copied = navigator.clipboard?.writeText(location.href) ?? Promise.reject(new Error("no clipboard"));
     copied.then(() => say("The link is copied."), () => say("The browser does not let this page copy; take the link from the address bar."));
+  });
+  // Back, forward, or a link that was pasted.
+  addEventListener("popstate", () => {
+    clearTimeout(typing);
+    Object.assign(state, readState());
+    restore();
+    hideChips(false);
+    void asking.ask();
   });
   panel.sheet.addEventListener("click", () => panel.sheet.setAttribute("aria-expanded", String(panel.aside.classList.toggle("large"))));
   new ResizeObserver(() => drawing.resize()).observe(panel.aside);

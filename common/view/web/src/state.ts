@@ -1,5 +1,5 @@
 // What a link to the page holds: questions, threshold and camera, in the address's fragment; and the history of
-// questions.
+// questions, the browser's and the one that is suggested.
 
 import type { Vector } from "./network";
 
@@ -13,6 +13,10 @@ export interface State {
 }
 
 const HISTORY = "slag-history";
+/** A question that stood shorter was on the way to another: it has no entry of its own in the browser's history. */
+const SETTLED_MS = 2000;
+
+let askedMs = -Infinity;
 
 export function readState(fragment = location.hash): State {
   const parameters = new URLSearchParams(fragment.replace(/^#/, ""));
@@ -27,13 +31,18 @@ export function readState(fragment = location.hash): State {
   };
 }
 
+/** Writes the address; another question is another entry of the browser's history. */
 export function writeState(state: State): void {
   const parameters = new URLSearchParams();
   if (state.question) parameters.set("q", state.question);
   if (state.second) parameters.set("and", state.second);
   if (state.threshold !== null) parameters.set("threshold", state.threshold.toFixed(3));
   if (state.camera) parameters.set("camera", [...state.camera.position, ...state.camera.target].map((v) => v.toFixed(3)).join(","));
-  history.replaceState(null, "", `#${parameters}`);
+  const written = new URLSearchParams(location.hash.slice(1));
+  const isOther = ["q", "and"].some((name) => written.get(name) !== parameters.get(name));
+  const isNew = isOther && performance.now() - askedMs > SETTLED_MS;
+  if (isOther) askedMs = performance.now();
+  history[isNew ? "pushState" : "replaceState"](null, "", `#${parameters}`);
 }
 
 export function readHistory(): string[] {
