@@ -103,6 +103,11 @@ test("keys reach the question and move the camera", () => opened(async (page) =>
   await page.keyboard.press("Enter");
   await page.locator("#details").getByText("Score").waitFor();
   assert.equal(await page.evaluate(() => document.activeElement.getAttribute("aria-expanded")), "true");
+  // The card has the focus, and keys still fly.
+  const [before] = await cameraOf(page);
+  await page.locator("#answers .card").focus();
+  await page.keyboard.press("KeyE", { delay: 500 });
+  assert.ok((await cameraOf(page))[0][2] > before[2]);
 }, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
 
 test("a service without a scene says so, and the page opens when it has one", () => opened(async (page, service) => {

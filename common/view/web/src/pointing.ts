@@ -2,6 +2,7 @@
 
 import { lengthText } from "./answers";
 import type { Asking } from "./asking";
+import { isForScene } from "./drawing/camera";
 import type { Drawing } from "./drawing/drawing";
 import { type Description, fetchObjectAt, type Vector } from "./network";
 import { panel, say } from "./panel";
@@ -91,8 +92,7 @@ export class Pointing {
   }
 
   private key(event: KeyboardEvent): void {
-    const isTyping = event.target instanceof HTMLInputElement && event.target.type !== "checkbox" && event.target.type !== "range";
-    if (isTyping || event.target instanceof HTMLTextAreaElement || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+    if (!isForScene(event)) return;
     const acts: Record<string, () => void> = {
       "/": () => panel.question.focus(), "?": () => panel.keys.showModal(), r: () => this.drawing.showOpening(), m: () => this.measure(), t: nextTheme,
       b: () => panel.showBoxes.click(), g: () => panel.showGrid.click(), p: () => panel.showPhotos.click(),

@@ -9,6 +9,13 @@ const [LEAST_RISE, MOST_RISE] = [0.35, 0.95];
 const GLIDE_MS = 700;
 const KEYS = ["KeyW", "KeyS", "KeyA", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
 
+/** Whether a key is for the scene: boxes for text take all keys, dialogs too, and sliders take arrows. */
+export function isForScene({ target, code, ctrlKey, metaKey, altKey }: KeyboardEvent): boolean {
+  const type = target instanceof HTMLInputElement ? target.type : "";
+  const isTaken = target instanceof HTMLTextAreaElement || (type === "range" ? code.startsWith("Arrow") : type !== "" && type !== "checkbox");
+  return !isTaken && !ctrlKey && !metaKey && !altKey && !document.querySelector("dialog[open]");
+}
+
 interface Glide {
   startMs: number;
   from: [THREE.Vector3, THREE.Vector3];
@@ -40,8 +47,8 @@ export class Camera {
       this.isDragged = this.wasMoved = true;
     });
     this.controls.addEventListener("end", () => (this.isDragged = false));
-    canvas.addEventListener("keydown", (event) => {
-      if (!KEYS.includes(event.code) || event.ctrlKey || event.metaKey || event.altKey) return;
+    document.addEventListener("keydown", (event) => {
+      if (!KEYS.includes(event.code) || !isForScene(event)) return;
       event.preventDefault();
       this.glide = null;
       this.leavePhoto();
@@ -49,8 +56,8 @@ export class Camera {
       this.wasMoved = true;
       onMove();
     });
-    canvas.addEventListener("keyup", (event) => this.pressed.delete(event.code));
-    canvas.addEventListener("blur", () => this.pressed.clear());
+    document.addEventListener("keyup", (event) => this.pressed.delete(event.code));
+    addEventListener("blur", () => this.pressed.clear());
   }
 
   /** The middle of what is not covered is what the camera looks at. */
