@@ -248,7 +248,14 @@ test("on a phone layers lie over the compass, chips are whole, and answers have 
     return document.elementFromPoint(x + 2, y + 4).closest("#hud, #layers").id;
   });
   assert.equal(top, "layers");
-  await page.locator("#layers summary").click();
+  const summary = page.locator("#layers summary");
+  for (const close of [() => page.keyboard.press("Escape"), () => page.mouse.click(100, 200), () => page.keyboard.press("?")]) {
+    await close();
+    assert.ok(await page.locator("#show-boxes").isHidden(), String(close));
+    await page.keyboard.press("Escape");
+    await summary.click();
+  }
+  await summary.click();
   await page.fill("#question", "chair");
   await answered(page, "chair");
   assert.ok(await page.locator("#facts").isHidden());

@@ -31,6 +31,7 @@ export const panel = {
   details: element("details"),
   blend: element<HTMLImageElement>("blend"),
   threshold: element<HTMLInputElement>("threshold"),
+  layers: element<HTMLDetailsElement>("layers"),
   showBoxes: element<HTMLInputElement>("show-boxes"),
   showGrid: element<HTMLInputElement>("show-grid"),
   showCells: element<HTMLInputElement>("show-cells"),

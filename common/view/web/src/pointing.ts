@@ -34,7 +34,10 @@ export class Pointing {
     canvas.addEventListener("pointerleave", () => this.hideHover());
     panel.measure.addEventListener("click", () => this.measure());
     panel.theme.addEventListener("click", nextTheme);
-    panel.help.addEventListener("click", () => panel.keys.showModal());
+    panel.help.addEventListener("click", () => this.help());
+    document.addEventListener("pointerdown", (event) => {
+      if (!panel.layers.contains(event.target as Node)) panel.layers.open = false;
+    });
     panel.whole.addEventListener("click", () => drawing.showOpening());
     document.addEventListener("keydown", (event) => this.key(event));
   }
@@ -91,12 +94,24 @@ export class Pointing {
     panel.hover.hidden = true;
   }
 
+  private help(): void {
+    panel.layers.open = false;
+    panel.keys.showModal();
+  }
+
+  /** Leaves what was opened last. */
+  private leave(): void {
+    if (panel.layers.open) panel.layers.open = false;
+    else if (this.isMeasuring) this.measure(false);
+    else this.asking.choose(null);
+  }
+
   private key(event: KeyboardEvent): void {
     if (!isForScene(event)) return;
     const acts: Record<string, () => void> = {
-      "/": () => panel.question.focus(), "?": () => panel.keys.showModal(), r: () => this.drawing.showOpening(), m: () => this.measure(), t: nextTheme,
+      "/": () => panel.question.focus(), "?": () => this.help(), r: () => this.drawing.showOpening(), m: () => this.measure(), t: nextTheme,
       b: () => panel.showBoxes.click(), g: () => panel.showGrid.click(), p: () => panel.showPhotos.click(),
-      Escape: () => (this.isMeasuring ? this.measure(false) : this.asking.choose(null)),
+      Escape: () => this.leave(),
     };
     const act = /^[1-9]$/.test(event.key) ? () => this.asking.choose(Number(event.key) - 1) : acts[event.key];
     if (!act) return;
