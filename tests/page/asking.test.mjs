@@ -136,6 +136,9 @@ test("a link shows the same questions, threshold and camera to others", () => op
   await page.locator("#threshold").fill("200");
   const shown = async (of) => [await of.inputValue("#question"), await of.inputValue("#second"), await of.inputValue("#threshold"), ...(await cameraOf(of))];
   const first = await shown(page);
+  // What became of the link takes nothing away from what was found.
+  await page.locator("#notice").getByText("The link is copied.").waitFor();
+  assert.equal(await page.locator("#message").innerText(), "1 found");
   const other = await page.context().newPage();
   await other.goto(page.url());
   await drawn(other);
@@ -158,4 +161,4 @@ test("a link shows the same questions, threshold and camera to others", () => op
   for (const [colour, n] of [["(r, g, b) => r > 90 && r - Math.min(g, b) > 45", 2000], ["(r, g, b) => b > 90 && b - r > 45", 2000]]) {
     assert.ok((await pixels(other, PANEL_PX, colour)).length > n, colour);
   }
-}, { isLookedAt: true, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, options: { permissions: ["clipboard-read", "clipboard-write"] }, fragment: `camera=${CAMERA}` }));

@@ -160,7 +160,7 @@ test("keys: the list of them, measuring, hovering, and the opening view again", 
   await at([-1, 2, 0]);
   await page.getByText("Click the second point.").waitFor();
   await at([-3, 2, 0]);
-  const said = await page.locator("#message").innerText();
+  const said = await page.locator("#notice").innerText();
   assert.ok(Math.abs(Number.parseFloat(said) - 2) < 0.2, said);
   await page.keyboard.press("m");
   await page.mouse.move(...project([1.2, 0.5, 0.7]));
@@ -216,7 +216,7 @@ test("a pointer meets large Gaussians anywhere on them, and measuring says where
   await page.getByText("Nothing there: click on a surface.").waitFor();
   await at([-2, 2, 0]);
   await page.getByText("between the two points").waitFor();
-  const said = await page.locator("#message").innerText();
+  const said = await page.locator("#notice").innerText();
   assert.ok(Math.abs(Number.parseFloat(said) - 2) < 0.1, said);
   await page.keyboard.press("m");
   await page.mouse.move(...project([0, 2, 0]));
@@ -249,7 +249,7 @@ test("on a phone layers lie over the compass, chips are whole, and answers have 
   });
   assert.equal(top, "layers");
   const summary = page.locator("#layers summary");
-  for (const close of [() => page.keyboard.press("Escape"), () => page.mouse.click(100, 200), () => page.keyboard.press("?")]) {
+  for (const close of [() => page.keyboard.press("Escape"), () => page.locator("#facts").click(), () => page.keyboard.press("?")]) {
     await close();
     assert.ok(await page.locator("#show-boxes").isHidden(), String(close));
     await page.keyboard.press("Escape");
@@ -268,14 +268,14 @@ test("a photo given to the page is found by the robot: the page stands there, an
   const photo = { name: "here.png", mimeType: "image/png", buffer: await page.screenshot() };
   service.behaviour.located = { state: "lost", reason: "too few features" };
   await page.locator("#photo").setInputFiles(photo);
-  await page.locator("#message").getByText("Lost: too few features").waitFor();
+  await page.locator("#notice").getByText("Lost: too few features").waitFor();
   const widthPx = photo.buffer.readUInt32BE(16);
   assert.ok(Math.abs(service.behaviour.focalPx - widthPx / 2 / Math.tan((65 * Math.PI) / 360)) < 0.1, `focal length ${service.behaviour.focalPx}`);
   // At (0, -3, 1), looking along y: x right, z up.
   service.behaviour.located = { state: "found", position_in_world: [0, -3, 1], optical_rotation_xyzw: [-Math.SQRT1_2, 0, 0, Math.SQRT1_2], n_inliers: 57 };
   await page.locator("#details input[type=number]").fill("300");
   await page.locator("#details").getByText("Find its place").click();
-  await page.locator("#message").getByText("Found by 57 landmarks").waitFor();
+  await page.locator("#notice").getByText("Found by 57 landmarks").waitFor();
   assert.equal(service.behaviour.focalPx, 300);
   const [position, target] = await cameraOf(page);
   assert.ok(Math.hypot(...minus(position, [0, -3, 1])) < 0.01, `stands at ${position}`);

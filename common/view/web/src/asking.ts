@@ -175,7 +175,7 @@ export class Asking {
 
   private fail(error: unknown, tell: (text: string, isError?: boolean) => void): void {
     this.isCutOff = error instanceof Offline;
-    this.report(error, tell);
+    this.report(error, this.isCutOff ? undefined : tell);
   }
 
   /** Lights only what was found: nothing is lit beside the words "not found". */

@@ -3,7 +3,7 @@
 import type { Asking } from "./asking";
 import type { Drawing } from "./drawing/drawing";
 import { type Description, locatePhoto, type Photo } from "./network";
-import { panel, say } from "./panel";
+import { note, panel } from "./panel";
 
 /** Across photos of a camera that the scene does not know, about that of phones and drones. */
 const FIELD_OF_VIEW_DEG = 65;
@@ -26,7 +26,7 @@ export class Dropping {
 
   private async take(file: File | undefined): Promise<void> {
     if (!file) return;
-    if (this.description().program !== "slag-edge") return say("Only a robot's page finds where a photo was taken.");
+    if (this.description().program !== "slag-edge") return note("Only a robot's page finds where a photo was taken.");
     try {
       // The robot sees pixels as they are stored.
       const { width, height } = await createImageBitmap(file, { imageOrientation: "none" });
@@ -65,12 +65,12 @@ export class Dropping {
   }
 
   private async find(file: File, width: number, height: number, focalPx: number): Promise<void> {
-    say("Looking for the photo's place…");
+    note("Looking for the photo's place…", false, true);
     const located = await locatePhoto(file, focalPx);
-    if (located.state !== "found") return say(`${located.state === "lost" ? "Lost" : "Unsure"}: ${located.reason}`);
+    if (located.state !== "found") return note(`${located.state === "lost" ? "Lost" : "Unsure"}: ${located.reason}`, false, true);
     const photo: Photo = { name: file.name, position_m: located.position_in_world, rotation_xyzw: located.optical_rotation_xyzw, width_px: width, height_px: height, focal_px: focalPx, has_picture: true };
     this.drawing.standAt(photo);
     await this.asking.layOver(photo, Promise.resolve(URL.createObjectURL(file)), null);
-    say(located.verified_by === "rendering" ? "Found: the scene looks like the photo from here." : `Found by ${located.n_inliers} landmarks.`);
+    note(located.verified_by === "rendering" ? "Found: the scene looks like the photo from here." : `Found by ${located.n_inliers} landmarks.`);
   }
 }

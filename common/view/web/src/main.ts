@@ -8,7 +8,7 @@ import { ChangesPanel } from "./changes";
 import { Dropping } from "./dropping";
 import { Drawing } from "./drawing/drawing";
 import { type Description, describe, fetchWords, follow, NotFound, setToken, Unauthorized, type Word } from "./network";
-import { askToken, covered, panel, say, showBeside, showFacts } from "./panel";
+import { askToken, covered, note, panel, say, showBeside, showFacts } from "./panel";
 import { forgetPictures } from "./photos";
 import { PlacesToStand } from "./places";
 import { Pointing } from "./pointing";
@@ -47,7 +47,7 @@ async function withToken<T>(request: () => Promise<T>): Promise<T> {
   }
 }
 
-function report(error: unknown, tell = say): void {
+function report(error: unknown, tell = note): void {
   if (error instanceof Unauthorized) {
     void withToken(describe).then(() => asking.ask());
     return;
@@ -162,11 +162,11 @@ async function look(): Promise<void> {
       stream();
       if (panel.showChanges.checked) void changes.show();
       if (description.can_ask && (state.question || state.second)) await askOnceDrawn();
-      say(isOtherGeneration ? `The service has generation ${seen.generation} now.` : "Other cells are on board now.");
+      note(isOtherGeneration ? `The service has generation ${seen.generation} now.` : "Other cells are on board now.");
     } else {
       streaming.update();
       if (!hasAllWords) void learnWords();
-      if (wasOffline) say("The service is back.");
+      if (wasOffline) note("The service is back.");
       if (asking.isCutOff) await asking.ask();
     }
   } catch (error) {
@@ -239,7 +239,7 @@ function listen(): void {
     writeState(state);
     // Browsers give pages a clipboard over HTTPS and on this machine only.
     const copied = navigator.clipboard?.writeText(location.href) ?? Promise.reject(new Error("no clipboard"));
-    copied.then(() => say("The link is copied."), () => say("The browser does not let this page copy; take the link from the address bar."));
+    copied.then(() => note("The link is copied."), () => note("The browser does not let this page copy; take the link from the address bar."));
   });
   // Back, forward, or a link that was pasted.
   addEventListener("popstate", () => {

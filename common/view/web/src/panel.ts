@@ -48,11 +48,26 @@ export const panel = {
   whole: element<HTMLButtonElement>("whole"),
 };
 
+/** Longer than the pause between two polls, so that an outage stays told. */
+const NOTE_MS = 6000;
+
+let noting = 0;
 const count = new Intl.NumberFormat("en");
 
+/** Says what came of the question. */
 export function say(text: string, isError = false): void {
   element("message").textContent = text;
   element("message").classList.toggle("error", isError);
+}
+
+/** Says something else below that, for a while or until there is other news. */
+export function note(text: string, isError = false, isLasting = false): void {
+  const notice = element("notice");
+  clearTimeout(noting);
+  // Screen readers read again what is written again.
+  if (notice.textContent !== text) notice.textContent = text;
+  notice.classList.toggle("error", isError);
+  if (!isLasting) noting = window.setTimeout(() => (notice.textContent = ""), NOTE_MS);
 }
 
 /** Puts a button behind what was said. */

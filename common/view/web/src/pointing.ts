@@ -5,7 +5,7 @@ import type { Asking } from "./asking";
 import { isForScene } from "./drawing/camera";
 import type { Drawing } from "./drawing/drawing";
 import { type Description, fetchObjectAt, type Vector } from "./network";
-import { panel, say } from "./panel";
+import { note, panel } from "./panel";
 import type { PlacesToStand } from "./places";
 import { nextTheme } from "./theme";
 
@@ -50,7 +50,7 @@ export class Pointing {
     panel.measure.setAttribute("aria-pressed", String(isOn));
     this.measured = [];
     this.drawing.showMeasured([], "");
-    say(isOn ? "Click two points of the scene." : "");
+    note(isOn ? "Click two points of the scene." : "", false, true);
   }
 
   private async click(xPx: number, yPx: number): Promise<void> {
@@ -72,12 +72,12 @@ export class Pointing {
   }
 
   private measureTo(point: Vector | null): void {
-    if (!point) return say("Nothing there: click on a surface.");
+    if (!point) return note("Nothing there: click on a surface.", false, true);
     this.measured = this.measured.length === 1 ? [this.measured[0], point] : [point];
     const [a, b] = this.measured;
     const text = b ? lengthText(Math.hypot(...a.map((v, i) => v - b[i])), this.description().metric) : "from here";
     this.drawing.showMeasured(this.measured, text);
-    say(b ? `${text} between the two points.` : "Click the second point.");
+    note(b ? `${text} between the two points.` : "Click the second point.", false, true);
   }
 
   private hover(xPx: number, yPx: number): void {
