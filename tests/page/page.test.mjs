@@ -46,6 +46,27 @@ test("typing asks after a pause, the slider unlights, a click shows the thing, a
   await page.getByText("nothing found").waitFor();
 }, { isLookedAt: true, behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
 
+/** As like a chair as the chair is, but no answer. */
+const STOOL = { name: "chair", min: [-1.5, 1.5, 0], max: [-0.5, 2.5, 1], n: [12, 12, 12] };
+
+test("only objects that answer are lit until the slider moves, and a slow question says that it is under way", () => opened(async (page) => {
+  await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined);
+  await answered(page, "chair");
+  const isOf = async (thing) => (await litPixels(page)).filter((pixel) => isInside(thing, pixel, 0)).length;
+  assert.equal(await isOf(STOOL), 0);
+  await page.locator("#threshold").fill("200");
+  assert.ok(await isOf(STOOL) > 500);
+  await page.route("**/v1/query*", async (route) => {
+    await new Promise((resolve) => setTimeout(resolve, 1500));
+    await route.continue();
+  });
+  await page.fill("#question", "ball");
+  await page.locator("#message").getByText("Looking…").waitFor();
+  assert.equal(await page.locator("#answers").getAttribute("aria-busy"), "true");
+  await answered(page, "ball");
+  assert.deepEqual([await page.locator("#message").innerText(), await page.locator("#answers").getAttribute("aria-busy")], ["1 found", "false"]);
+}, { isLookedAt: true, behaviour: { things: [...THINGS, STOOL] }, fragment: `q=chair&camera=${CAMERA}` }));
+
 test("negatives go to the service, and there may be more answers than are shown", () => opened(async (page, service) => {
   await drawn(page);
   await page.fill("#question", "chair -wall -floor");

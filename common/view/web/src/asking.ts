@@ -6,7 +6,7 @@ import { clustersOf, topScore, voxelOf } from "./clusters";
 import type { Question } from "./drawing/cells";
 import type { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, MAX_ANSWERS, Offline, parseQuestion, type Photo } from "./network";
+import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, isObject, MAX_ANSWERS, Offline, parseQuestion, type Photo } from "./network";
 import { offer, panel, say, showLegend, showSecond } from "./panel";
 import { pictureOf } from "./photos";
 import type { PlacesToStand } from "./places";
@@ -14,6 +14,8 @@ import { remember, type State, writeState } from "./state";
 
 /** Where things were found, Gaussians are lit from this share of the range of scores, or a lower threshold. */
 const SHARE_OF_RANGE = 0.75;
+/** A question that takes longer is said to be under way. */
+const SLOW_MS = 400;
 /** Objects below this share of the threshold are weak: groups answer in their place where they are surer, as on robots. */
 const SURE = 1.15;
 
@@ -46,12 +48,13 @@ function noneText({ thing, best, isOfPoints, threshold, none, isBelowThreshold, 
 const countText = ({ answers, hasMore }: Answers) => (hasMore ? `${answers.length}+` : String(answers.length || "not"));
 const shortened = (reply: Answers): Answers => ({ ...reply, answers: reply.answers.slice(0, MAX_ANSWERS), hasMore: reply.answers.length > MAX_ANSWERS });
 
-/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found; outside of answers floors do. */
+/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. Outside of objects other things do, trees beside a car. */
 function levelsFrom({ scores, reply: { threshold, answers } }: Found): { threshold: number; outside: number; answers: Answer[] } {
   const high = scores.min + SHARE_OF_RANGE * (scores.max - scores.min);
   const things = answers.filter(({ id }) => id);
-  const outside = levelOf(threshold ?? high, scores);
-  return { threshold: things.length > 0 ? Math.min(outside, levelOf(high, scores)) : outside, outside, answers: things };
+  const found = levelOf(threshold ?? high, scores);
+  const outside = answers.some(isObject) ? Infinity : found;
+  return { threshold: things.length > 0 ? Math.min(found, levelOf(high, scores)) : found, outside, answers: things };
 }
 
 /** As robots judge it: the first answer's score as a share of the threshold. */
@@ -148,8 +151,16 @@ export class Asking {
     const { signal } = this.controller;
     this.isCutOff = false;
     writeState(state);
+    // The answers of the question before are not this one's.
+    const slow = setTimeout(() => {
+      if (signal.aborted) return;
+      say("Looking…");
+      panel.answers.ariaBusy = "true";
+    }, SLOW_MS);
     const [first, beside] = await Promise.allSettled([state.question, state.second].map((line) => this.fetchBoth(line, signal)));
+    clearTimeout(slow);
     if (signal.aborted) return;
+    panel.answers.ariaBusy = "false";
     const found = [first, beside].map((asked) => (asked.status === "fulfilled" ? asked.value : null));
     // Scores of another generation would light the wrong Gaussians; the next poll brings both.
     if (found.some((one) => one && one.scores.generation !== this.description().generation % 2 ** 32)) return this.onOther();
