@@ -181,15 +181,19 @@ test("an arrow leads to what is out of view, a chip lists all that is on board",
   assert.equal(await chips.first().innerText(), "all30");
   await chips.first().click();
   assert.deepEqual([await chips.count(), await chips.last().innerText()], [30, "thing 291"]);
-  // It looks at the chair, then turns half round to the left.
+  // It looks at the chair and the ball, then turns half round to the left.
   await page.fill("#question", "chair");
-  await answered(page, "chair");
+  await page.click("#more");
+  await page.fill("#second", "ball");
+  await answered(page, "chair | ball");
+  await page.locator("#labels .second:not(.beyond)").getByText("ball").waitFor();
   const label = page.locator("#labels .answer");
   await label.waitFor();
   assert.ok(!(await label.getAttribute("class")).includes("beyond"));
   await page.locator("#canvas").focus();
   await page.keyboard.down("ArrowLeft");
   await page.locator("#labels .answer.beyond").waitFor();
+  await page.locator("#labels .second.beyond").waitFor();
   await page.keyboard.up("ArrowLeft");
   const { x, width } = await label.boundingBox();
   assert.ok(x + width > WIDTH - 30 && x + width <= WIDTH, `the right edge: ${x} + ${width}`);

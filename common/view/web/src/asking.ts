@@ -197,6 +197,7 @@ export class Asking {
     const second = lit(beside);
     this.second = second && { scores: second.scores, ...levelsFrom(second) };
     showSecond(beside && `${beside.reply.thing}: ${countText(beside.reply)} found`);
+    this.drawing.showSecond(beside?.reply.thing ?? "", beside?.reply.answers ?? []);
     const { threshold } = this.state;
     const levels = first && levelsFrom(first);
     if (!first || !levels || !this.scores) this.colour(0);

@@ -58,7 +58,7 @@ export class Drawing {
   private readonly up: THREE.Vector3;
   private readonly hud: Hud;
   private theme: Theme = "dark";
-  private readonly labelled = { answers: [] as Label[], robot: [] as Label[], measured: [] as Label[] };
+  private readonly labelled = { answers: [] as Label[], second: [] as Label[], robot: [] as Label[], measured: [] as Label[] };
   private shown: [Answer[], number[], number | null] = [[], [], null];
   private robotSeen = "";
   private isDirty = true;
@@ -137,10 +137,20 @@ export class Drawing {
   showAnswers(name: string, answers: Answer[], opacities: number[], chosen: number | null): void {
     this.shown = [answers, opacities, chosen];
     this.marks.showAnswers(answers, opacities, chosen, this.theme);
-    const over = (answer: Answer) => new THREE.Vector3(...boxOf(answer).centre).addScaledVector(this.up, boxOf(answer).size[2] / 2).toArray() as Vector;
-    this.labelled.answers = answers.slice(0, MAX_LABELS).map((answer, i) => ({ text: i === chosen ? name : String(i + 1), at: over(answer), kind: i === chosen ? "chosen" : "answer" }))
+    this.labelled.answers = answers.slice(0, MAX_LABELS).map((answer, i) => ({ text: i === chosen ? name : String(i + 1), at: this.over(answer), kind: i === chosen ? "chosen" : "answer" }))
       .filter((_, i) => chosen === null || i === chosen);
     this.writeLabels();
+  }
+
+  /** Names what a second question found. */
+  showSecond(name: string, answers: Answer[]): void {
+    this.labelled.second = answers.slice(0, MAX_LABELS).map((answer) => ({ text: name, at: this.over(answer), kind: "second" }));
+    this.writeLabels();
+  }
+
+  private over(answer: Answer): Vector {
+    const { centre, size } = boxOf(answer);
+    return new THREE.Vector3(...centre).addScaledVector(this.up, size[2] / 2).toArray() as Vector;
   }
 
   /** Looks at an answer as its best photo does, from nearby; without that from where the camera is. */
@@ -341,7 +351,7 @@ export class Drawing {
   }
 
   private get labelsNow(): Label[] {
-    return [...this.labelled.measured, ...this.labelled.answers, ...this.labelled.robot];
+    return [...this.labelled.measured, ...this.labelled.answers, ...this.labelled.second, ...this.labelled.robot];
   }
 
   private writeLabels(): void {
@@ -359,7 +369,7 @@ export class Drawing {
     const taken: [number, number, number][] = [];
     this.labelsNow.forEach(({ at, kind }, i) => {
       const label = this.labels.children[i] as HTMLElement;
-      const isAnswer = kind === "answer" || kind === "chosen";
+      const isAnswer = ["answer", "chosen", "second"].includes(kind);
       const edge = isAnswer ? this.edgeTowards(at) : null;
       label.classList.toggle("beyond", edge !== null);
       if (edge) label.style.setProperty("--towards", `${edge.angleRad}rad`);
