@@ -166,6 +166,10 @@ test("keys: the list of them, measuring, hovering, and the opening view again", 
   await page.mouse.move(...project([1.2, 0.5, 0.7]));
   await page.locator("#hover").waitFor();
   assert.match(await page.locator("#hover").innerText(), /\d cm above ground$/);
+  await page.mouse.move(740, 639);
+  await page.locator("#hover").waitFor();
+  const { y, height } = await page.locator("#hover").boundingBox();
+  assert.ok(y + height <= 640, `${y} + ${height}`);
   const [before] = await cameraOf(page);
   await page.locator("#canvas").focus();
   await page.keyboard.press("r");
@@ -197,6 +201,11 @@ test("an arrow leads to what is out of view, a chip lists all that is on board",
   await page.keyboard.up("ArrowLeft");
   const { x, width } = await label.boundingBox();
   assert.ok(x + width > WIDTH - 30 && x + width <= WIDTH, `the right edge: ${x} + ${width}`);
+  // The scale in the corner stays free.
+  await page.evaluate(() => { location.hash = "q=chair&camera=0.5,-6,4,-4,2,4.5"; });
+  await page.waitForFunction(() => document.querySelector("#labels .answer.beyond")?.getBoundingClientRect().y > 500);
+  const [low, scale] = [await label.boundingBox(), await page.locator("#hud").boundingBox()];
+  assert.ok(low.x + low.width > scale.x && low.y + low.height <= scale.y, `${low.y} + ${low.height}, ${scale.y}`);
 }, { behaviour: { words: MANY }, fragment: `camera=${CAMERA}` }));
 
 /** A floor, and a terrace 2 m above it. */

@@ -86,7 +86,8 @@ export class Pointing {
     const height = `${lengthText(Math.max(surface.heightM, 0), this.description().metric)} above ground`;
     panel.hover.textContent = surface.score === null ? height : `score ${surface.score.toFixed(2)} · ${height}`;
     panel.hover.hidden = false;
-    panel.hover.style.transform = `translate(${Math.min(xPx + 14, innerWidth - panel.hover.offsetWidth - 8)}px, ${yPx + 14}px)`;
+    const { offsetWidth, offsetHeight } = panel.hover;
+    panel.hover.style.transform = `translate(${Math.min(xPx + 14, innerWidth - offsetWidth - 8)}px, ${Math.min(yPx + 14, innerHeight - offsetHeight - 8)}px)`;
   }
 
   private hideHover(): void {

@@ -375,7 +375,8 @@ export class Drawing {
       if (edge) label.style.setProperty("--towards", `${edge.angleRad}rad`);
       const pixel = edge?.at ?? this.pixelOf(at);
       const isHidden = isAnswer && !this.marks.boxes.visible;
-      const [xPx, yPx] = pixel ? [pixel[0] - label.offsetWidth / 2, pixel[1] - (edge ? 10 : 24)] : [0, 0];
+      const xPx = pixel ? pixel[0] - label.offsetWidth / 2 : 0;
+      const yPx = edge ? this.hud.beside([xPx, edge.at[1] - 10], label.offsetWidth) : pixel ? pixel[1] - 24 : 0;
       const isCovering = taken.some(([x, y, width]) => x < xPx + label.offsetWidth + 4 && xPx < x + width + 4 && Math.abs(y - yPx) < 24);
       label.style.visibility = !pixel || isCovering || isHidden ? "hidden" : "visible";
       label.style.transform = `translate(${xPx}px, ${yPx}px)`;

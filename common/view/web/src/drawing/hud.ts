@@ -3,8 +3,11 @@
 import * as THREE from "three";
 
 const LONGEST_PX = 120;
+/** Height of a label and a gap. */
+const LABEL_PX = 24;
 
 export class Hud {
+  private readonly element = document.getElementById("hud")!;
   private readonly compass = document.getElementById("compass") as unknown as SVGElement;
   private readonly north = document.getElementById("north")!;
   private readonly bar = document.getElementById("scale-bar")!;
@@ -13,6 +16,13 @@ export class Hud {
   constructor(private readonly up: THREE.Vector3, private readonly isMetric: boolean, isGeographic: boolean) {
     // Elsewhere than on the earth there is no north: the world's second axis, which lies where north would.
     this.north.textContent = isGeographic ? "N" : "y";
+  }
+
+  /** The top of a label that stands at `[xPx, yPx]`, or beside the compass and the scale if it would cover them. */
+  beside([xPx, yPx]: [number, number], widthPx: number): number {
+    const { left, right, top, bottom } = this.element.getBoundingClientRect();
+    if (xPx > right || xPx + widthPx < left || yPx > bottom || yPx + LABEL_PX < top) return yPx;
+    return top > innerHeight / 2 ? top - LABEL_PX : bottom;
   }
 
   /** `forward`: where the camera looks; `metresPerPx`: at what it looks at. */
