@@ -81,6 +81,8 @@ test("keys choose a suggestion, and screen readers are told which", () => opened
   }
   await box.fill("");
   assert.ok((await options.allInnerTexts()).includes("wallbefore"));
+  await page.waitForTimeout(300);
+  assert.ok(await page.locator("#chips").isHidden());
 }));
 
 test("a click chooses a suggestion, and a second question has its own", () => opened(async (page, service) => {

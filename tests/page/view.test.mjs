@@ -118,7 +118,10 @@ test("lit and unlit differ by 3 to 1 in lightness in every theme, and for eyes t
   await layer(page, "grid", false);
   const devtools = await page.context().newCDPSession(page);
   const FLOOR = { name: "floor", min: [2, -3, -0.1], max: [3.5, -1.5, 0] };
+  const ramp = () => page.locator("#ramp").evaluate((canvas) => canvas.toDataURL());
+  const ramps = new Set();
   for (const theme of ["dark", "light", "contrast"]) {
+    ramps.add(await ramp());
     assert.equal(await page.evaluate(() => document.documentElement.dataset.theme), theme);
     for (const type of ["none", "protanopia", "deuteranopia", "tritanopia"]) {
       await devtools.send("Emulation.setEmulatedVisionDeficiency", { type });
@@ -131,6 +134,7 @@ test("lit and unlit differ by 3 to 1 in lightness in every theme, and for eyes t
     await devtools.send("Emulation.setEmulatedVisionDeficiency", { type: "none" });
     await page.click("#theme");
   }
+  assert.equal(ramps.size, 3);
 }, { isLookedAt: true, fragment: `q=chair&camera=${CAMERA}` }));
 
 /** Mean colours inside of things' outlines, away from their edges. */
@@ -153,6 +157,7 @@ test("keys: the list of them, measuring, hovering, and the opening view again", 
   await drawn(page);
   await page.keyboard.press("?");
   await page.locator("#keys").getByText("opening view").waitFor();
+  assert.equal(await page.evaluate(() => document.activeElement.id), "keys-title");
   await page.keyboard.press("Escape");
   await page.keyboard.press("m");
   // Two places on the floor, 2 m apart.
@@ -274,7 +279,16 @@ test("on a phone layers lie over the compass, chips are whole, and answers have 
   assert.ok(await page.locator("#facts").isHidden());
   const { y, height } = await page.locator("#answers .card").first().boundingBox();
   assert.ok(y + height <= 844, `${y + height}`);
-}, { behaviour: { words: ["mirror", "window", "dog", "pallet", "chair", "excavator", "pipe", "table", "bookshelf", "floor", "bench", "log"].map((word) => ({ word, n_things: 3 })) }, options: { ...PHONE, isMobile: true } }));
+  // The open answer's photo is whole, the handle stays, and nothing covers the larger panel.
+  await page.locator("#answers .card").tap();
+  const photo = page.locator("#details figure svg");
+  await photo.waitFor();
+  assert.equal(await photo.evaluate((svg) => svg.getBoundingClientRect().bottom <= innerHeight), true);
+  await page.getByRole("button", { name: "Larger panel" }).tap();
+  assert.ok(await page.locator("#tools").isHidden());
+  await page.locator("#places").scrollIntoViewIfNeeded();
+  await page.getByRole("button", { name: "Smaller panel" }).tap();
+}, { behaviour: { photos: [PHOTO], evidence: EVIDENCE, goal: "unreachable", words: ["mirror", "window", "dog", "pallet", "chair", "excavator", "pipe", "table", "bookshelf", "floor", "bench", "log"].map((word) => ({ word, n_things: 3 })) }, options: { ...PHONE, isMobile: true } }));
 
 test("a photo given to the page is found by the robot: the page stands there, and lays it over", () => opened(async (page, service) => {
   await drawn(page);

@@ -87,7 +87,12 @@ export function openCard(answers: Answer[], chosen: number | null, asked: Asked,
   const item = panel.answers.children[chosen];
   item.append(panel.details);
   panel.details.append(facts(answer, asked), copying(() => copies(answer, asked.query, place())));
-  item.scrollIntoView({ block: "nearest" });
+  showChosen();
+}
+
+/** Scrolls to the chosen card, which grows as its photo arrives. */
+function showChosen(): void {
+  panel.details.closest("li")?.scrollIntoView({ block: "nearest" });
 }
 
 function facts(answer: Answer, { description, query, threshold }: Asked): HTMLDListElement {
@@ -147,9 +152,11 @@ export async function showPhoto(photo: Photo, picture: Promise<string> | null, b
   figure.prepend(photoWithBox(url, photo, boxPx));
   const blend = make("input");
   Object.assign(blend, { type: "range", min: "0", max: "100", value: "0", id: "blend-share" });
-  blend.setAttribute("aria-label", "Photo over the scene");
   blend.addEventListener("input", () => onBlend(Number(blend.value) / 100));
-  caption.append(blend);
+  const label = make("label", "Photo over the scene");
+  label.append(blend);
+  caption.append(label);
+  showChosen();
 }
 
 /** Lists places to stand in the details, or says why there is none. */

@@ -8,7 +8,7 @@ import { ChangesPanel } from "./changes";
 import { Dropping } from "./dropping";
 import { Drawing } from "./drawing/drawing";
 import { type Description, describe, fetchWords, follow, NotFound, setToken, Unauthorized, type Word } from "./network";
-import { askToken, covered, note, panel, say, showBeside, showFacts } from "./panel";
+import { askToken, covered, note, paintRamp, panel, say, showBeside, showFacts } from "./panel";
 import { forgetPictures } from "./photos";
 import { PlacesToStand } from "./places";
 import { Pointing } from "./pointing";
@@ -111,11 +111,12 @@ async function learnWords(): Promise<void> {
     panel.question.value = word;
     read();
   });
-  hideChips(false);
+  hideChips();
 }
 
 /** Chips make room for suggestions and for answers. */
-function hideChips(isSuggesting: boolean): void {
+function hideChips(): void {
+  const isSuggesting = [panel.questionSuggestions, panel.secondSuggestions].some(({ hidden }) => !hidden);
   panel.chips.hidden = isSuggesting || panel.question.value.trim() !== "" || panel.chips.childElementCount === 0;
 }
 
@@ -203,7 +204,7 @@ function read(): void {
   clearTimeout(typing);
   if (panel.question.value.trim() !== state.question) state.threshold = null;
   [state.question, state.second] = [panel.question.value.trim(), panel.second.value.trim()];
-  hideChips(false);
+  hideChips();
   void asking.ask();
 }
 
@@ -246,10 +247,10 @@ function listen(): void {
     clearTimeout(typing);
     Object.assign(state, readState());
     restore();
-    hideChips(false);
+    hideChips();
     void asking.ask();
   });
-  panel.sheet.addEventListener("click", () => panel.sheet.setAttribute("aria-expanded", String(panel.aside.classList.toggle("large"))));
+  panel.sheet.addEventListener("click", () => panel.sheet.setAttribute("aria-label", panel.aside.classList.toggle("large") ? "Smaller panel" : "Larger panel"));
   new ResizeObserver(() => drawing.resize()).observe(panel.aside);
 }
 
@@ -272,5 +273,8 @@ async function start(): Promise<void> {
   if (description.program === "slag-edge") void hearEvents();
 }
 
-followTheme((theme) => drawing?.setTheme(theme));
+followTheme((theme) => {
+  drawing?.setTheme(theme);
+  paintRamp();
+});
 void start();

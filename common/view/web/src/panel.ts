@@ -110,6 +110,12 @@ export function showLegend(range: { min: number; max: number } | null, level: nu
   panel.threshold.value = String(level);
   panel.threshold.setAttribute("aria-valuetext", score);
   element("threshold-value").textContent = score;
+  paintRamp();
+}
+
+/** Paints the scores from the slider on in the theme's colours. */
+export function paintRamp(): void {
+  const level = Number(panel.threshold.value);
   const context = element<HTMLCanvasElement>("ramp").getContext("2d");
   for (let l = 0; context && l < 256; l++) {
     const [r, g, b] = l >= level ? rampColour((l - level) / Math.max(255 - level, 1), PALETTES[themeNow()].warm) : [120, 126, 133];

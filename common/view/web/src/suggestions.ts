@@ -84,7 +84,7 @@ export class Combobox {
 
   /** `source` suggests lines for a text; `onChoose` is called when the box has a suggestion, `onOpen` when the list opens or closes. */
   constructor(private readonly input: HTMLInputElement, private readonly list: HTMLElement,
-    private readonly source: (line: string) => Suggestion[], private readonly onChoose: () => void, private readonly onOpen: (isOpen: boolean) => void) {
+    private readonly source: (line: string) => Suggestion[], private readonly onChoose: () => void, private readonly onOpen: () => void) {
     input.addEventListener("focus", () => this.open());
     input.addEventListener("click", () => this.open());
     input.addEventListener("input", () => this.open());
@@ -139,7 +139,7 @@ export class Combobox {
   private mark(): void {
     const isOpen = this.suggestions.length > 0;
     this.list.hidden = !isOpen;
-    this.onOpen(isOpen);
+    this.onOpen();
     this.input.setAttribute("aria-expanded", String(isOpen));
     [...this.list.children].forEach((option, index) => option.setAttribute("aria-selected", String(index === this.active)));
     const option = this.list.children[this.active];
