@@ -57,6 +57,10 @@ test("what is not found is told with the best score, and the nearest are shown i
   await page.getByRole("button", { name: "Show the nearest anyway" }).click();
   await page.locator("#answers .card").first().waitFor();
   assert.match(await page.locator("#answers .card").first().innerText(), /wall[^]*weak/);
+  const long = "Donaudampfschifffahrt".repeat(10);
+  await page.fill("#question", long);
+  await answered(page, long);
+  assert.ok(await page.locator("#panel").evaluate((panel) => panel.scrollWidth <= panel.clientWidth));
   service.behaviour.none = { kind: "clusters-too-small", detail: "3 Gaussians reach 0.30953595", best_score: 0.32 };
   await page.fill("#question", "armchair");
   await page.getByText("Not found. 3 Gaussians reach 0.310").waitFor();

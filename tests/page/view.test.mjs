@@ -203,6 +203,8 @@ test("an arrow leads to what is out of view, a chip lists all that is on board",
   await page.keyboard.down("ArrowLeft");
   await page.locator("#labels .answer.beyond").waitFor();
   await page.locator("#labels .second.beyond").waitFor();
+  const second = await page.locator("#labels .second").boundingBox();
+  assert.ok(second.x >= PANEL_PX && second.x + second.width <= WIDTH, `${second.x} + ${second.width}`);
   await page.keyboard.up("ArrowLeft");
   const { x, width } = await label.boundingBox();
   assert.ok(x + width > WIDTH - 30 && x + width <= WIDTH, `the right edge: ${x} + ${width}`);

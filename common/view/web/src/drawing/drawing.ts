@@ -17,6 +17,7 @@ import { PALETTES } from "./ramp";
 const MAX_LABELS = 9;
 /** Arrows to what is out of view stand so far from the edge. */
 const MARGIN_PX = 26;
+const EDGE_PX = 6;
 /** Largest distance between a click and the mark it means. */
 const NEAR_PX = 14;
 const BACKGROUNDS: Record<Theme, number> = { dark: 0x14181d, light: 0xeceff2, contrast: 0x000000 };
@@ -375,7 +376,9 @@ export class Drawing {
       if (edge) label.style.setProperty("--towards", `${edge.angleRad}rad`);
       const pixel = edge?.at ?? this.pixelOf(at);
       const isHidden = isAnswer && !this.marks.boxes.visible;
-      const xPx = pixel ? pixel[0] - label.offsetWidth / 2 : 0;
+      // At an edge a long label is whole.
+      const [lowPx, highPx] = edge ? [this.covered()[0] + EDGE_PX, this.canvas.clientWidth - label.offsetWidth - EDGE_PX] : [-Infinity, Infinity];
+      const xPx = pixel ? Math.min(Math.max(pixel[0] - label.offsetWidth / 2, lowPx), highPx) : 0;
       const yPx = edge ? this.hud.beside([xPx, edge.at[1] - 10], label.offsetWidth) : pixel ? pixel[1] - 24 : 0;
       const isCovering = taken.some(([x, y, width]) => x < xPx + label.offsetWidth + 4 && xPx < x + width + 4 && Math.abs(y - yPx) < 24);
       label.style.visibility = !pixel || isCovering || isHidden ? "hidden" : "visible";
