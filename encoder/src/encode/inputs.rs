@@ -115,8 +115,8 @@ impl Inputs {
 fn check_up(&Up { axis, sign }: &Up) {
     if sign <= Sign::Unknown && axis.z < LEAST_UP_Z {
         tracing::warn!(
-            "metres are stated, with z up, but floors and photos say that up is ({:.2}, {:.2}, {:.2}): robots would find no ground; \
-             turn poses and splat, or leave out --metric and the geo-reference",
+            "metres are stated, with z up, but surfaces and photos suggest that up is ({:.2}, {:.2}, {:.2}): if so, robots find no \
+             ground; turn poses and splat, or leave out --metric and the geo-reference",
             axis.x,
             axis.y,
             axis.z
