@@ -48,7 +48,7 @@ function noneText({ thing, best, isOfPoints, threshold, none, isBelowThreshold, 
 const countText = ({ answers, hasMore }: Answers) => (hasMore ? `${answers.length}+` : String(answers.length || "not"));
 const shortened = (reply: Answers): Answers => ({ ...reply, answers: reply.answers.slice(0, MAX_ANSWERS), hasMore: reply.answers.length > MAX_ANSWERS });
 
-/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. Outside of objects other things do, trees beside a car. */
+/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. Outside of objects, other things reach that level, too: trees beside a car. */
 function levelsFrom({ scores, reply: { threshold, answers } }: Found): { threshold: number; outside: number; answers: Answer[] } {
   const high = scores.min + SHARE_OF_RANGE * (scores.max - scores.min);
   const things = answers.filter(({ id }) => id);
@@ -155,12 +155,12 @@ export class Asking {
     const slow = setTimeout(() => {
       if (signal.aborted) return;
       say("Looking…");
-      panel.answers.ariaBusy = "true";
+      panel.answers.setAttribute("aria-busy", "true");
     }, SLOW_MS);
     const [first, beside] = await Promise.allSettled([state.question, state.second].map((line) => this.fetchBoth(line, signal)));
     clearTimeout(slow);
     if (signal.aborted) return;
-    panel.answers.ariaBusy = "false";
+    panel.answers.setAttribute("aria-busy", "false");
     const found = [first, beside].map((asked) => (asked.status === "fulfilled" ? asked.value : null));
     // Scores of another generation would light the wrong Gaussians; the next poll brings both.
     if (found.some((one) => one && one.scores.generation !== this.description().generation % 2 ** 32)) return this.onOther();

@@ -248,7 +248,7 @@ function listen(): void {
     Object.assign(state, readState());
     restore();
     hideChips();
-    void asking.ask();
+    if (description.can_ask) void asking.ask();
   });
   panel.sheet.addEventListener("click", () => panel.sheet.setAttribute("aria-label", panel.aside.classList.toggle("large") ? "Smaller panel" : "Larger panel"));
   new ResizeObserver(() => drawing.resize()).observe(panel.aside);

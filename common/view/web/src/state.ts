@@ -39,7 +39,7 @@ export function writeState(state: State): void {
   if (state.threshold !== null) parameters.set("threshold", state.threshold.toFixed(3));
   if (state.camera) parameters.set("camera", [...state.camera.position, ...state.camera.target].map((v) => v.toFixed(3)).join(","));
   const written = new URLSearchParams(location.hash.slice(1));
-  const isOther = ["q", "and"].some((name) => written.get(name) !== parameters.get(name));
+  const isOther = ["q", "and"].some((name) => (written.get(name) ?? "") !== (parameters.get(name) ?? ""));
   const isNew = isOther && performance.now() - askedMs > SETTLED_MS;
   if (isOther) askedMs = performance.now();
   history[isNew ? "pushState" : "replaceState"](null, "", `#${parameters}`);
