@@ -127,13 +127,18 @@ impl TextService {
         self.known.as_ref()?.asked_as(&words_to_find(text, None).ok()?)
     }
 
+    /// Refuses a text of several things where the model knows few words.
+    pub(crate) fn check_one(&self, text: &str) -> Result<(), TextError> {
+        Ok(self.known.as_ref().map_or(Ok(()), |known| known.check_one(text))?)
+    }
+
     pub(crate) fn is_alive(&self) -> bool {
         self.is_alive.load(Ordering::Relaxed)
     }
 
     /// Returns a text's vector, `[dim]`, unit length. Blocks while other texts are encoded.
     pub fn encode(&self, text: &str) -> Result<Arc<[f32]>, TextError> {
-        let key = words_to_find(text, self.known.as_deref())?;
+        let key = words_to_find(text, None)?;
         if let Some(vector) = self.cache().get(&key) {
             return Ok(vector);
         }

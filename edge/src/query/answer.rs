@@ -49,7 +49,13 @@ impl OnBoard {
         let (mut places, mut labels, mut plain) = (Vec::new(), Vec::new(), Vec::new());
         for (at, asked) in request.asked.iter().enumerate() {
             let vector = match asked {
-                Asked::Text(text) => self.encode(text)?,
+                Asked::Text(text) => {
+                    // As it is, where relations are not wanted.
+                    if request.relations {
+                        self.text.check_one(text)?;
+                    }
+                    self.encode(text)?
+                }
                 Asked::Vector { vector, .. } => vector_of(vector, snapshot.manifest.encoder.dim)?,
                 Asked::Phrase { phrase, .. } => {
                     let things = phrase.things().into_iter();
@@ -58,7 +64,10 @@ impl OnBoard {
                         (0..snapshot.manifest.encoder.dim).map(|at| f32::from(at == 0)).collect();
                     let questions = things.map(|thing| match relations::is_anything(thing) {
                         true => Ok(question(Arc::clone(&any))),
-                        false => Ok(question(self.encode(thing)?)),
+                        false => {
+                            self.text.check_one(thing)?;
+                            Ok(question(self.encode(thing)?))
+                        }
                     });
                     let questions = questions.collect::<Result<Vec<_>, QueryError>>()?;
                     let of_thing = snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES;
