@@ -92,7 +92,8 @@ test("a click chooses a suggestion, and a second question has its own", () => op
   await page.locator("#second-suggestions").getByText("ball").click();
   await answered(page, "ball");
   assert.ok(await page.locator("#question-suggestions").isHidden());
-  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=ball"));  // One that is refused leaves the other's answers.
+  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=ball"));
+  // One that is refused leaves the other's answers.
   await page.fill("#question", "chair");
   await answered(page, "chair | ball");
   await page.fill("#second", "bal");
@@ -138,7 +139,7 @@ test("a link shows the same questions, threshold and camera to others", () => op
   await page.locator("#threshold").fill("200");
   const shown = async (of) => [await of.inputValue("#question"), await of.inputValue("#second"), await of.inputValue("#threshold"), ...(await cameraOf(of))];
   const first = await shown(page);
-  // What became of the link takes nothing away from what was found.
+  // News of the link leaves the number of answers in place.
   await page.locator("#notice").getByText("The link is copied.").waitFor();
   assert.equal(await page.locator("#message").innerText(), "1 found");
   const other = await page.context().newPage();

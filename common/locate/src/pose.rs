@@ -23,8 +23,8 @@ const MIN_SIGMA_PX: f64 = 0.5;
 pub(crate) const FOCAL_SIGMA: f64 = 0.02;
 /// The same of an estimate, besides what the scatter of the errors shows: depths of the map are wrong together.
 const MAP_FOCAL_SIGMA: f64 = 0.005;
-/// Matches whose errors are alike, for neighbours of a map are wrong together: on 48 photos of the labelled house positions
-/// are off by 2.5 times what independent matches would say.
+/// Number of matches that count as one, because errors of neighbouring landmarks are alike: on 48 photos of the labelled
+/// house, positions are 2.5 times as far off as independent matches would suggest.
 const ALIKE: f64 = 6.0;
 /// Median length of a normal vector of two components, in standard deviations: sqrt(2 ln 2).
 const MEDIAN_RADIUS: f64 = 1.1774;

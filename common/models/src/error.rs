@@ -33,7 +33,7 @@ pub enum InferenceError {
     },
     #[error("the built-in model knows no {}; use words of: {}", unknown.join(", "), known.join(", "))]
     UnknownWords { unknown: Vec<String>, known: Vec<String> },
-    /// Of each, a mixture would find a part.
+    /// The vector of such a text is a mixture, which finds one of them at best.
     #[error("the text names several things ({}); ask for each alone (robots with objects answer relations between them)", .0.join(", "))]
     SeveralThings(Vec<String>),
     #[error("crop {index} has no pixels to encode; drop empty masks first")]

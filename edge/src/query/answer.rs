@@ -198,7 +198,7 @@ impl Answering<'_> {
         self.each(asked, &searches, |text, question, search| self.gaussians((text, kind), question, search))
     }
 
-    /// Bounds negatives by what answers a question without them, unless the request states what answers.
+    /// Sets the least score of negatives to the threshold without them, unless the request has a threshold of its own.
     fn bounded(&self, questions: &[Question], calibration: Option<Calibration>) -> Vec<Question> {
         let (request, manifest) = (self.request, self.scene.manifest);
         let plain = Scale(ScoreKind::Cosine).threshold(request, manifest, calibration).0;

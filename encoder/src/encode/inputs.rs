@@ -111,7 +111,7 @@ impl Inputs {
     }
 }
 
-/// Warns of a scene with metres and z up whose surfaces say otherwise.
+/// Warns if the surfaces of a metric scene suggest that z does not point up.
 fn check_up(&Up { axis, sign }: &Up) {
     if sign <= Sign::Unknown && axis.z < LEAST_UP_Z {
         tracing::warn!(

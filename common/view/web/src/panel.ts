@@ -64,7 +64,7 @@ export function say(text: string, isError = false): void {
 export function note(text: string, isError = false, isLasting = false): void {
   const notice = element("notice");
   clearTimeout(noting);
-  // Screen readers read again what is written again.
+  // Screen readers would repeat a text that is written again.
   if (notice.textContent !== text) notice.textContent = text;
   notice.classList.toggle("error", isError);
   if (!isLasting) noting = window.setTimeout(() => (notice.textContent = ""), NOTE_MS);
