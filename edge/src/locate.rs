@@ -2,13 +2,14 @@
 
 use std::io::Cursor;
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use image::{DynamicImage, ImageDecoder};
 pub use slag_api::locate::{Answer, Pose, Verification};
 use slag_common::photo::{self, HEAD_BYTES, PhotoError};
 use slag_common::{Intrinsics, pinhole};
 use slag_locate::{
-    CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, Renderer, locate, map_bytes, working_bytes,
+    CODE_VERSION, Grey, Located, Map, Outcome, Photo, Pinhole, Prior, Renderer, locate, map_bytes,
+    working_bytes,
 };
 use slag_service::params::RequestError;
 
@@ -159,10 +160,7 @@ pub fn answer(
         Outcome::Found(found) => Answer::Found(pose(&found)),
         Outcome::Unsure(candidates) => {
             let reason = match candidates.as_slice() {
-                [Located { other_focal_px: Some(other), .. }, ..] => format!(
-                    "the landmarks fit a focal length of {other:.0} px better than the stated {:.0} px: is the photo a smaller copy, or zoomed?",
-                    camera.focal_px
-                ),
+                [Located { other_camera: Some(other), .. }, ..] => contradiction(other, &intrinsics),
                 [_] => "too few landmarks agree with the best pose".into(),
                 _ => "poses in several places agree with the photo".into(),
             };
@@ -170,6 +168,21 @@ pub fn answer(
         }
         Outcome::Lost(reason) => Answer::Lost { reason: reason.to_string() },
     })
+}
+
+fn contradiction(other: &Pinhole, stated: &Intrinsics) -> String {
+    let aspect = other.focal.y / other.focal.x;
+    if aspect == 1.0 && other.centre == DVec2::new(stated.centre_x_px, stated.centre_y_px) {
+        return format!(
+            "the landmarks fit a focal length of {:.0} px better than the stated {:.0} px: is the photo a smaller copy, zoomed, or cropped?",
+            other.focal.x, stated.focal_x_px
+        );
+    }
+    format!(
+        "the landmarks fit a camera with its centre at {:.0},{:.0} and a vertical focal length of {aspect:.2} times the \
+         horizontal one better than the stated one (centre {:.0},{:.0}): is the photo cropped (give centre_px) or stretched?",
+        other.centre.x, other.centre.y, stated.centre_x_px, stated.centre_y_px
+    )
 }
 
 fn pose_of(snapshot: &Snapshot, located: &Located) -> Pose {

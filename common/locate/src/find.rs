@@ -9,7 +9,8 @@ use crate::features::{Feature, MAX_FEATURES, features};
 use crate::grey::Grey;
 use crate::map::{Map, code};
 use crate::matching::Query;
-use crate::pose::{FOCAL_SIGMA, Match, POSE, POSE_AND_FOCAL, Pinhole, covariance, focal_sigma, refine};
+use crate::pose::{FOCAL_SIGMA, Match, POSE, POSE_AND_FOCAL, POSE_AND_LENS, Pinhole};
+use crate::pose::{covariance, focal_sigma, lens_distance, refine};
 use crate::ransac::{Agreed, INLIER_PX, MAX_SAMPLES, SOFT_PX, locally_refined, ransac, samples};
 use crate::render::{Compared, Renderer};
 
@@ -49,6 +50,8 @@ const MAX_ZOOM_SAMPLES: usize = 1000;
 const FREEING_ROUNDS: usize = 4;
 /// Standard deviations by which the landmarks may contradict the stated focal length.
 const FOCAL_SIGMAS: f64 = 3.0;
+/// Squared Mahalanobis distance by which they may contradict its aspect and principal point.
+const MAX_LENS_DISTANCE: f64 = 25.0;
 
 /// A photo with its camera; gravity and a prior where they are known.
 #[derive(Clone, Copy, Debug)]
@@ -89,8 +92,8 @@ pub struct Located {
     pub n_inliers: usize,
     /// Whether a rendering at the pose matches the photo.
     pub is_verified: bool,
-    /// Focal length of the pose where the landmarks contradict the stated one, pixels.
-    pub other_focal_px: Option<f64>,
+    /// Camera of the pose where the landmarks contradict the stated one.
+    pub other_camera: Option<Pinhole>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -182,7 +185,7 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
             Verified::NotDrawn => search.unverified(&proposals, MIN_INLIERS),
         };
     match outcome {
-        Outcome::Found(found) if found.other_focal_px.is_some() => Outcome::Unsure(vec![*found]),
+        Outcome::Found(found) if found.other_camera.is_some() => Outcome::Unsure(vec![*found]),
         outcome => outcome,
     }
 }
@@ -359,7 +362,10 @@ impl Search<'_> {
         }
         let start =
             Fit { camera: self.camera, camera_from_world: *camera_from_world, matches: inliers.clone() };
-        let (fit, is_other) = self.with_focal(&start);
+        let (mut fit, mut is_other) = self.with_focal(&start);
+        if let Some(free) = self.with_lens(&fit) {
+            (fit, is_other) = (free, true);
+        }
         let covariance =
             covariance(&fit.camera, &fit.camera_from_world, &fit.matches).ok_or(Reason::NoSpread)?;
         Ok(Located {
@@ -367,7 +373,7 @@ impl Search<'_> {
             covariance,
             n_inliers: fit.matches.len(),
             is_verified,
-            other_focal_px: is_other.then_some(fit.camera.focal_px()),
+            other_camera: is_other.then_some(fit.camera),
         })
     }
 
@@ -375,7 +381,7 @@ impl Search<'_> {
     /// landmarks contradict it; then they alone count.
     fn with_focal(&self, start: &Fit) -> (Fit, bool) {
         let zoomed = self.zoomed.get_or_init(|| self.zoomed(start)).clone();
-        let fits = self.freed(start).into_iter().chain(zoomed);
+        let fits = self.freed_focal(start).into_iter().chain(zoomed);
         let Some((free, sigma)) = fits.max_by_key(|(fit, _)| fit.matches.len()) else {
             return (start.clone(), false);
         };
@@ -391,22 +397,35 @@ impl Search<'_> {
         (refined.map_or_else(|| start.clone(), fit), false)
     }
 
+    /// Returns the best fit with any aspect and principal point if the landmarks contradict the stated ones: the photo
+    /// is cropped or stretched.
+    fn with_lens(&self, start: &Fit) -> Option<Fit> {
+        let free = self.freed::<POSE_AND_LENS>(start)?;
+        let at = (&free.camera, &free.camera_from_world);
+        let distance = lens_distance(&self.camera, at, &free.matches)?;
+        (distance > MAX_LENS_DISTANCE && free.matches.len() >= start.matches.len()).then_some(free)
+    }
+
     /// Returns the best fit to the landmarks near a camera with any focal length, and the standard deviation of that
     /// focal length's logarithm.
-    fn freed(&self, start: &Fit) -> Option<(Fit, f64)> {
-        let mut fit = start.clone();
-        for _ in 0..FREEING_ROUNDS {
-            let (camera, pose) =
-                refine::<POSE_AND_FOCAL>(&fit.camera, &fit.camera_from_world, &fit.matches, SOFT_PX)?;
-            let mut matches = self.query.match_guided(self.map, &camera, &pose, self.size_px);
-            matches.retain(|one| camera.error(&pose, one) < INLIER_PX);
-            fit = Fit { camera, camera_from_world: pose, matches };
-        }
+    fn freed_focal(&self, start: &Fit) -> Option<(Fit, f64)> {
+        let fit = self.freed::<POSE_AND_FOCAL>(start)?;
         let sigma = focal_sigma(&fit.camera, &fit.camera_from_world, &fit.matches)?;
         Some((fit, sigma))
     }
 
-    /// Returns the fit from the pose with most inliers at other focal lengths, as [`Self::freed`] does. `than`: the fit
+    fn freed<const N: usize>(&self, start: &Fit) -> Option<Fit> {
+        let mut fit = start.clone();
+        for _ in 0..FREEING_ROUNDS {
+            let (camera, pose) = refine::<N>(&fit.camera, &fit.camera_from_world, &fit.matches, SOFT_PX)?;
+            let mut matches = self.query.match_guided(self.map, &camera, &pose, self.size_px);
+            matches.retain(|one| camera.error(&pose, one) < INLIER_PX);
+            fit = Fit { camera, camera_from_world: pose, matches };
+        }
+        Some(fit)
+    }
+
+    /// Returns the fit from the pose with most inliers at other focal lengths, as [`Self::freed_focal`] does. `than`: the fit
     /// that it must exceed.
     fn zoomed(&self, than: &Fit) -> Option<(Fit, f64)> {
         let is_inlier = |one: &&Match| than.camera.error(&than.camera_from_world, one) < INLIER_PX;
@@ -419,7 +438,7 @@ impl Search<'_> {
                 ransac(&camera, &self.all, SEED, max_samples)?;
             Some(Fit { camera, camera_from_world, matches })
         });
-        self.freed(&fits.max_by_key(|fit| fit.matches.len())?)
+        self.freed_focal(&fits.max_by_key(|fit| fit.matches.len())?)
     }
 }
 

@@ -24,6 +24,7 @@ pub use features::{Feature, MAX_FEATURES, features, working_bytes};
 pub use find::{Located, Outcome, Photo, Prior, Reason, locate};
 pub use grey::Grey;
 pub use map::{CODE_VERSION, Code, Map, code, map_bytes};
+pub use pose::Pinhole;
 pub use ransac::p3p;
 pub use render::{Renderer, Rendering, point_in_world};
 pub use slag_common::landmarks::Landmark;

@@ -26,13 +26,18 @@ const MAP_FOCAL_SIGMA: f64 = 0.005;
 /// Number of matches that count as one, because errors of neighbouring landmarks are alike: on 48 photos of the labelled
 /// house, positions are 2.5 times as far off as independent matches would suggest.
 const ALIKE: f64 = 6.0;
+/// Standard deviations of what is known of a lens before the photo is seen: of the logarithm of its vertical focal
+/// length's ratio to the horizontal one, and of its principal point as a share of the horizontal one.
+const ASPECT_SIGMA: f64 = 0.01;
+const CENTRE_SIGMA: f64 = 0.02;
 /// Median length of a normal vector of two components, in standard deviations: sqrt(2 ln 2).
 const MEDIAN_RADIUS: f64 = 1.1774;
 
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Pinhole {
-    focal: DVec2,
-    centre: DVec2,
+/// A camera without distortion; pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pinhole {
+    pub focal: DVec2,
+    pub centre: DVec2,
 }
 
 impl Pinhole {
@@ -53,11 +58,16 @@ impl Pinhole {
 
     /// Returns the camera with a focal length `exp(log)` times as long.
     pub(crate) fn zoomed(&self, log: f64) -> Self {
-        Self { focal: self.focal * log.exp(), ..*self }
+        self.changed(&[log])
     }
 
-    pub(crate) fn focal_px(&self) -> f64 {
-        self.focal.x
+    /// Changes the logarithms of the focal length and of its aspect, then the principal point, as far as given.
+    fn changed(&self, by: &[f64]) -> Self {
+        let by: [f64; 4] = std::array::from_fn(|at| by.get(at).copied().unwrap_or(0.0));
+        Self {
+            focal: self.focal * by[0].exp() * DVec2::new(1.0, by[1].exp()),
+            centre: self.centre + DVec2::new(by[2], by[3]),
+        }
     }
 
     /// Logarithm of the focal length's ratio to another camera's.
@@ -76,6 +86,9 @@ impl Pinhole {
 pub(crate) const POSE: usize = 6;
 /// The same, then the focal length's relative change.
 pub(crate) const POSE_AND_FOCAL: usize = 7;
+/// The same, then the change of the vertical focal length's ratio to the horizontal one, and of the principal point,
+/// pixels.
+pub(crate) const POSE_AND_LENS: usize = 10;
 
 /// Normal equations of the parameters.
 struct Normal<const N: usize> {
@@ -99,9 +112,12 @@ fn normal_equations<const N: usize>(
         // d pixel / d p, then d p = rotation x p + translation.
         let rows = [DVec3::new(fx, 0.0, -fx * p.x / p.z), DVec3::new(0.0, fy, -fy * p.y / p.z)];
         let spread = pixel - camera.centre;
-        for (row, error, spread) in [(rows[0], error.x, spread.x), (rows[1], error.y, spread.y)] {
+        let lens = [[spread.x, 0.0, 1.0, 0.0], [spread.y, spread.y, 0.0, 1.0]];
+        for (row, error, lens) in [(rows[0], error.x, lens[0]), (rows[1], error.y, lens[1])] {
             let turned = p.cross(row);
-            let j = [turned.x, turned.y, turned.z, row.x, row.y, row.z, spread];
+            let j = [turned.to_array(), row.to_array()].concat();
+            let j: [f64; POSE_AND_LENS] =
+                std::array::from_fn(|at| if at < POSE { j[at] } else { lens[at - POSE] });
             for a in 0..N {
                 of.vector[a] += weight * j[a] * error;
                 for b in 0..N {
@@ -137,7 +153,7 @@ fn inverse<const N: usize>(mut m: [[f64; N]; N]) -> Option<[[f64; N]; N]> {
     Some(out)
 }
 
-/// Refines a pose, and the focal length with [`POSE_AND_FOCAL`], by least squares; errors above `soft_px` count less
+/// Refines a pose, with [`POSE_AND_FOCAL`] or [`POSE_AND_LENS`] the camera too, by least squares; errors above `soft_px` count less
 /// (Cauchy).
 pub(crate) fn refine<const N: usize>(
     camera: &Pinhole,
@@ -153,8 +169,8 @@ pub(crate) fn refine<const N: usize>(
         let turn = DQuat::from_scaled_axis(DVec3::new(step[0], step[1], step[2]));
         let shift = DVec3::new(step[3], step[4], step[5]);
         pose = DAffine3::from_rotation_translation(turn, shift) * pose;
-        camera = camera.zoomed(step.get(POSE).copied().unwrap_or(0.0));
-        if !pose.is_finite() || !camera.focal.is_finite() {
+        camera = camera.changed(&step[POSE..]);
+        if !pose.is_finite() || !camera.focal.is_finite() || !camera.centre.is_finite() {
             return None;
         }
         if step.iter().all(|s| s.abs() < 1e-10) {
@@ -166,7 +182,14 @@ pub(crate) fn refine<const N: usize>(
     Some((camera, DAffine3::from_rotation_translation(rotation, pose.translation)))
 }
 
-/// Covariance of the parameters. The errors' standard deviation comes from their median; `prior` is that of the focal
+/// Variance of the errors along an axis, from their median.
+fn variance(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -> Option<f64> {
+    let mut errors: Vec<f64> = matches.iter().map(|one| camera.error(pose, one)).collect();
+    errors.sort_by(f64::total_cmp);
+    Some((errors.get(errors.len() / 2)? / MEDIAN_RADIUS).max(MIN_SIGMA_PX).powi(2))
+}
+
+/// Covariance of the parameters; `prior` is that of the focal
 /// length's relative error before the photo is seen.
 fn covariance_in_camera(
     camera: &Pinhole,
@@ -174,9 +197,7 @@ fn covariance_in_camera(
     matches: &[Match],
     prior: f64,
 ) -> Option<[[f64; POSE_AND_FOCAL]; POSE_AND_FOCAL]> {
-    let mut errors: Vec<f64> = matches.iter().map(|one| camera.error(pose, one)).collect();
-    errors.sort_by(f64::total_cmp);
-    let variance = (errors.get(errors.len() / 2)? / MEDIAN_RADIUS).max(MIN_SIGMA_PX).powi(2);
+    let variance = variance(camera, pose, matches)?;
     let mut matrix = normal_equations::<POSE_AND_FOCAL>(camera, pose, matches, |_| 1.0).matrix;
     matrix[POSE][POSE] += variance / (prior * prior);
     let of = inverse(matrix)?.map(|row| row.map(|v| variance * v));
@@ -187,6 +208,28 @@ fn covariance_in_camera(
 /// Standard deviation of the focal length's relative error, from the matches alone.
 pub(crate) fn focal_sigma(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -> Option<f64> {
     Some(covariance_in_camera(camera, pose, matches, f64::INFINITY)?[POSE][POSE].sqrt())
+}
+
+/// Squared Mahalanobis distance between the stated aspect and principal point and those that the matches alone give.
+pub(crate) fn lens_distance(
+    stated: &Pinhole,
+    (camera, pose): (&Pinhole, &DAffine3),
+    matches: &[Match],
+) -> Option<f64> {
+    let variance = ALIKE * variance(camera, pose, matches)?;
+    let of = inverse(normal_equations::<POSE_AND_LENS>(camera, pose, matches, |_| 1.0).matrix)?;
+    let aspect = |of: &Pinhole| (of.focal.y / of.focal.x).ln();
+    let centre = camera.centre - stated.centre;
+    let off = [aspect(camera) - aspect(stated), centre.x, centre.y];
+    let priors = [ASPECT_SIGMA, CENTRE_SIGMA * stated.centre.x, CENTRE_SIGMA * stated.centre.x];
+    let sum: [[f64; 3]; 3] = std::array::from_fn(|a| {
+        std::array::from_fn(|b| {
+            let prior = if a == b { priors[a].powi(2) } else { 0.0 };
+            variance * of[POSE_AND_FOCAL + a][POSE_AND_FOCAL + b] + prior
+        })
+    });
+    let inverse = inverse(sum)?;
+    Some((0..9).map(|ab| off[ab / 3] * inverse[ab / 3][ab % 3] * off[ab % 3]).sum())
 }
 
 /// Covariance of the camera's position and of a small rotation about the world's axes, row by row.

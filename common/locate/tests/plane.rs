@@ -137,7 +137,7 @@ fn a_wrong_focal_length_is_told_or_held() {
     for factor in [0.67, 1.1, 2.0] {
         for outcome in stated(factor) {
             let Outcome::Unsure(candidates) = outcome else { panic!("{factor}: {outcome:?}") };
-            let focal_px = candidates[0].other_focal_px.expect("another");
+            let focal_px = candidates[0].other_camera.expect("another").focal.x;
             assert!((focal_px / INTRINSICS.focal_x_px - 1.0).abs() < 0.03, "{factor}: {focal_px}");
         }
     }
@@ -146,6 +146,26 @@ fn a_wrong_focal_length_is_told_or_held() {
         let moved = found.camera_from_world.inverse().translation.distance(truth.inverse().translation);
         let sigma = [0, 7, 14].map(|at| found.covariance[at]).iter().sum::<f64>().sqrt();
         assert!(moved < 3.0 * sigma && sigma < 0.05, "{moved} {sigma}");
+    }
+}
+
+/// As of a crop, and of a copy that was stretched, with the whole photo's camera.
+#[test]
+fn a_wrong_centre_or_aspect_is_told() {
+    let map = map_of(1);
+    let truth = looking(DVec3::new(0.6, -1.1, 1.7), DVec3::new(0.2, 0.3, 0.0));
+    let grey = draw(1, &truth, &INTRINSICS).grey;
+    let of = INTRINSICS;
+    let centre = Intrinsics { centre_x_px: 1.4 * of.centre_x_px, ..of };
+    let aspect = Intrinsics { focal_y_px: 1.25 * of.focal_y_px, ..of };
+    for stated in [centre, aspect] {
+        let photo = Photo { grey: &grey, intrinsics: &stated, gravity_in_camera: None, prior: None };
+        for renderer in [None, Some(&Floor(1) as &dyn Renderer)] {
+            let outcome = locate(&map, &photo, renderer);
+            // A plane does not tell by which of them the camera is another.
+            let Outcome::Unsure(candidates) = outcome else { panic!("{stated:?}: {outcome:?}") };
+            assert!(candidates[0].other_camera.is_some());
+        }
     }
 }
 

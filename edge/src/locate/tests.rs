@@ -148,7 +148,7 @@ fn the_body_of_a_level_camera_is_not_turned() {
         covariance: [0.0; 36],
         n_inliers: 9,
         is_verified: false,
-        other_focal_px: None,
+        other_camera: None,
     };
     let Pose { position_in_world, rotation_xyzw, optical_rotation_xyzw, geographic, .. } =
         pose_of(&snapshot, &found);

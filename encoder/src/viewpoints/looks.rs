@@ -28,6 +28,8 @@ const MIN_WEIGHT: f32 = 0.09;
 const N_SIDES: u8 = 8;
 /// Sine of the elevation from which a camera is steeply above: 37 degrees.
 const STEEP: f64 = 0.6;
+/// Sine of the angle below the horizon up to which a camera looks at things from beside: 15 degrees.
+const LEVEL: f64 = 0.26;
 /// Bytes of a look: eight per Gaussian, about three Gaussians per pixel.
 pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
 
@@ -35,6 +37,8 @@ pub(super) struct Look {
     /// From the planner's axes.
     pub(super) camera: DAffine3,
     pub(super) verdict: Verdict,
+    /// What it is preferred by, among views that show as much.
+    pub(super) preference: u64,
     /// Gaussians, and the side from which they are seen.
     pub(super) seen: Vec<(u32, u8)>,
 }
@@ -108,7 +112,7 @@ pub(super) fn look(
     if verdict.fault(kind).is_some() {
         seen = Vec::new();
     }
-    Ok(Look { camera, verdict, seen })
+    Ok(Look { camera, verdict, preference: preference(kind, camera), seen })
 }
 
 /// Counts pixels that are no holes, and of those the near and the hazy ones, by median depth. `layers`: Gaussians from
@@ -130,6 +134,12 @@ fn count_pixels(layers: &[(f64, &[RegionWeight])], sums: &[(f64, f64)], near: f6
         }
     }
     [n_covered, n_near, n_hazy]
+}
+
+/// Outdoors, image encoders know things from beside better than from above; few low views are clear enough to be good.
+fn preference(kind: SceneKind, camera: DAffine3) -> u64 {
+    let forward = camera.matrix3.row(2);
+    if kind == SceneKind::Outdoor && forward.z > -LEVEL { 2 } else { 1 }
 }
 
 /// Side from which a Gaussian is seen, by the direction to the camera.

@@ -263,7 +263,8 @@ impl Seen {
 fn greedy(looks: &[Look], n_gaussians: usize, n_views: usize) -> (Vec<usize>, f64) {
     let mut state = vec![Seen::default(); n_gaussians];
     let gain = |state: &[Seen], look: &Look| -> u64 {
-        look.seen.iter().map(|(gaussian, side)| u64::from(state[*gaussian as usize].gain(*side))).sum()
+        let gains = look.seen.iter().map(|(gaussian, side)| u64::from(state[*gaussian as usize].gain(*side)));
+        look.preference * gains.sum::<u64>()
     };
     // (gain, first look, number of chosen looks when the gain was computed)
     let mut heap: BinaryHeap<_> =
