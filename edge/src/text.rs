@@ -124,7 +124,7 @@ impl TextService {
 
     /// Returns the replacement of a text with words unknown to the model.
     pub(crate) fn asked_as(&self, text: &str) -> Option<String> {
-        self.known.as_ref()?.asked_as(&words_to_find(text, None).ok()?)
+        self.known.as_ref()?.asked_as(&words_to_find(text).ok()?)
     }
 
     /// Refuses a text of several things where the model knows few words.
@@ -138,7 +138,7 @@ impl TextService {
 
     /// Returns a text's vector, `[dim]`, unit length. Blocks while other texts are encoded.
     pub fn encode(&self, text: &str) -> Result<Arc<[f32]>, TextError> {
-        let key = words_to_find(text, None)?;
+        let key = words_to_find(text)?;
         if let Some(vector) = self.cache().get(&key) {
             return Ok(vector);
         }

@@ -120,4 +120,13 @@ fn views_that_see_nothing_are_left_out() {
     let skipped = summary.skipped_views;
     assert_eq!((summary.n_views, skipped.len()), (3, 1), "{skipped:?}");
     assert!(skipped[0].reason.contains("sees no Gaussian"), "{skipped:?}");
+    // The store is as without them.
+    let cells = || {
+        slag_encoder::store::StoreReader::open(&room.settings.output.store).unwrap().manifest().cells.clone()
+    };
+    let with_it = cells();
+    json["frames"].as_array_mut().unwrap().remove(1);
+    fs_err::write(poses, json.to_string()).unwrap();
+    assert_eq!(room.encode(|_| {}).unwrap().skipped_views.len(), 0);
+    assert!(cells() == with_it);
 }

@@ -36,6 +36,10 @@ pub enum InferenceError {
     /// The vector of such a text is a mixture, which finds one of them at best.
     #[error("the text names several things ({}); ask for each alone (robots with objects answer relations between them)", .0.join(", "))]
     SeveralThings(Vec<String>),
+    #[error(
+        "the text compares things or places ({0:?}), which robots with objects answer; ask here for the thing alone"
+    )]
+    Comparison(String),
     #[error("crop {index} has no pixels to encode; drop empty masks first")]
     EmptyCrop { index: usize },
     #[error(transparent)]

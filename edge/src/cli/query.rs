@@ -162,8 +162,19 @@ fn notes(answers: &Answers) -> String {
         ThresholdSource::Relevancy => "closer than any negative",
     };
     let Searched { n_matching, n_searched, threshold, .. } = found;
-    let mut notes =
-        format!("{n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}\n");
+    let counted = match (&answers.related, answers.kind) {
+        (Some(related), _) => {
+            let parts = related.parts.iter().map(|part| {
+                format!("{} {:?} from {:.3}", part.n_found, visible(&part.thing), part.threshold)
+            });
+            format!("on board: {}", parts.collect::<Vec<_>>().join(", "))
+        }
+        (None, AnswerKind::Objects) => format!(
+            "objects with {n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}"
+        ),
+        _ => format!("{n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}"),
+    };
+    let mut notes = format!("{counted}\n");
     if let Some(missing) = answers.coverage.missing() {
         notes += &format!("{missing}\n");
     }

@@ -19,6 +19,7 @@ use super::scale::{Scale, ScoreKind, ThresholdSource};
 use super::scene::{Scene, alignment, default_voxel, unit};
 use crate::score::{Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Search, score_objects};
 use slag_common::manifest::{Calibration, Manifest};
+use slag_models::question::asked_thing;
 
 /// Memory for the candidates of a thing: 256 of 1 kB.
 const CANDIDATES_BYTES: usize = 256 << 10;
@@ -96,7 +97,7 @@ impl OnBoard {
     /// Returns the texts that replace things and negatives with words unknown to the model.
     fn asked_as(&self, asked: &Asked, request: &QueryRequest) -> BTreeMap<String, String> {
         let things: Vec<String> = match asked {
-            Asked::Text(text) => vec![relations::asked_thing(text).unwrap_or_else(|| text.clone())],
+            Asked::Text(text) => vec![asked_thing(text).unwrap_or_else(|| text.clone())],
             Asked::Phrase { phrase, .. } => phrase.things().into_iter().map(str::to_owned).collect(),
             Asked::Vector { .. } => Vec::new(),
         };

@@ -10,7 +10,6 @@ use slag_common::manifest::{Manifest, TextModelRecord};
 use slag_models::{InferenceError, ModelDir, SessionOptions};
 
 use super::names::{Names, Words};
-use super::relations;
 use super::request::{QueryRequest, RequestError, check_text};
 use crate::score::{OverBudget, ScoreError};
 use crate::store::files::Stat;
@@ -116,8 +115,7 @@ impl OnBoard {
 
     pub(super) fn encode(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
         check_text("text", text)?;
-        let thing = relations::asked_thing(text);
-        Ok(self.text.encode(thing.as_deref().unwrap_or(text))?)
+        Ok(self.text.encode(text)?)
     }
 
     pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {

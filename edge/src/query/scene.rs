@@ -4,8 +4,7 @@ use glam::DVec3;
 use slag_api::UNITS;
 use slag_api::coverage::{BadCellAnswer, Coverage};
 use slag_api::objects::Alignment;
-use slag_common::frames::Aabb;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
 use slag_math::stats::median;
@@ -25,8 +24,8 @@ pub struct Scene<'a> {
     pub objects: Vec<Option<Objects<'a>>>,
     pub index: &'a ObjectIndex,
     pub manifest: &'a Manifest,
-    /// Centre and radius of the area on board.
-    pub fetched: (DVec3, f64),
+    /// Cells without a shard on board.
+    pub not_fetched: Vec<&'a CellRecord>,
     /// Cells whose shards could not be fetched.
     pub bad_cells: &'a [BadCell],
 }
@@ -38,7 +37,7 @@ impl<'a> Scene<'a> {
             objects: snapshot.shards.iter().map(|shard| shard.additions().objects).collect(),
             index: &snapshot.objects,
             manifest: &snapshot.manifest,
-            fetched: (snapshot.current.centre_in_world, snapshot.current.radius),
+            not_fetched: snapshot.not_fetched().collect(),
             bad_cells: &snapshot.bad_cells,
         }
     }
@@ -53,14 +52,11 @@ impl<'a> Scene<'a> {
             generation: bad.old.map(|old| old.generation),
         };
         let bad_cells: Vec<BadCellAnswer> = self.bad_cells.iter().filter(touches).map(described).collect();
-        // The whole region is surely on board if all of ball or box is, as their intersection counts.
-        let (centre, radius) = self.fetched;
-        let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);
-        let reach = |b: &Aabb| (b.min - centre).abs().max((b.max - centre).abs()).length();
-        let bounds = region.bounds.map(|bounds| reach(&bounds) <= radius);
-        let is_fetched = ball.into_iter().chain(bounds).reduce(|a, b| a || b);
+        let is_bad = |cell_id: u32| self.bad_cells.iter().any(|bad| bad.cell_id == cell_id);
+        let lacks = |cell: &&&CellRecord| region.touches(&cell.bounds) && !is_bad(cell.cell_id);
+        let n_cells_not_fetched = self.not_fetched.iter().filter(lacks).count() as u64;
         let are_there = bad_cells.iter().all(|bad| bad.generation.is_some());
-        Coverage { area_fetched: is_fetched.map(|is_fetched| is_fetched && are_there), bad_cells }
+        Coverage { area_fetched: Some(n_cells_not_fetched == 0 && are_there), n_cells_not_fetched, bad_cells }
     }
 }
 

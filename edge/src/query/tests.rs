@@ -43,8 +43,9 @@ fn on_scene<T>(built: &[BuiltShard], work: impl FnOnce(&Scene<'_>) -> T) -> T {
 fn on_scene_of<T>(built: &[BuiltShard], manifest: &Manifest, work: impl FnOnce(&Scene<'_>) -> T) -> T {
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
     let objects: Vec<_> = built.iter().map(|shard| shard.layout.additions(&shard.bytes).objects).collect();
-    let (index, fetched) = (ObjectIndex::new(&objects), (DVec3::ZERO, 50.0));
-    work(&Scene { shards, objects, index: &index, manifest, fetched, bad_cells: &[] })
+    let index = ObjectIndex::new(&objects);
+    let not_fetched = manifest.cells.iter().skip(built.len()).collect();
+    work(&Scene { shards, objects, index: &index, manifest, not_fetched, bad_cells: &[] })
 }
 
 fn described(built: &[BuiltShard], answers: &Answers, near: Option<DVec3>) -> Vec<GaussianAnswer> {
@@ -78,7 +79,7 @@ fn clusters_are_ranked_nearest_best() {
     let answers = ask(&yard, |_, _| ());
     assert_eq!((answers.searched.n_searched, answers.searched.n_matching, answers.unit), (724, 224, "m"));
     assert_eq!(answers.reason.as_ref(), None);
-    assert_eq!(answers.coverage.area_fetched, None);
+    assert_eq!(answers.coverage.area_fetched, Some(true));
     assert!(!answers.searched.is_exact);
     let found = clusters(&answers);
     // Equal things without an asker: ordered by first Gaussian. Four Gaussians are too few.
@@ -174,8 +175,30 @@ fn empty_answers_say_why() {
     let nothing = ask(&yard, ball(DVec3::new(49.0, 49.0, 0.0), 2.0));
     let reason = nothing.reason.expect("nothing there");
     assert_eq!((reason.kind, reason.best_score), (ReasonKind::NothingThere, None));
-    assert_eq!(nothing.coverage.area_fetched, Some(false));
-    assert_eq!(ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0)).coverage.area_fetched, Some(false));
+    assert_eq!(nothing.coverage.area_fetched, Some(true));
+    // Of two more cells at 48 and 60 m nothing was fetched.
+    for (radius, expected) in [(Some(1.5), 0), (Some(3.0), 1), (Some(30.0), 2), (None, 2)] {
+        let answers = ask(&yard, |request, manifest| {
+            for at in [48.0, 60.0] {
+                let bounds = Aabb { min: DVec3::splat(at), max: DVec3::splat(at + 1.0) };
+                manifest.cells.push(slag_common::manifest::CellRecord {
+                    cell_id: 70 + at as u32,
+                    bounds,
+                    ..manifest.cells[0].clone()
+                });
+            }
+            let ball = |radius| Ball { centre_in_world: DVec3::new(46.0, 48.0, 48.0), radius };
+            (request.threshold, request.region.ball) = (Some(1.0), radius.map(ball));
+        });
+        let found = answers.coverage;
+        assert_eq!(
+            (found.area_fetched, found.n_cells_not_fetched),
+            (Some(expected == 0), expected),
+            "{radius:?}"
+        );
+        let detail = answers.reason.expect("nothing").detail;
+        assert_eq!(detail.contains("not fetched"), expected > 0, "{detail}");
+    }
     let gaussians =
         ask(&yard, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(1.0)));
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
@@ -332,8 +355,7 @@ fn boxes_bound_what_is_searched() {
     // Points at -5, -4.99, ..: 50 of them lie below -4.501.
     assert_eq!((answers.searched.n_matching, answers.coverage.area_fetched), (50, Some(true)));
     let far = ask(&yard, |request, _| request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 1.0]));
-    assert_eq!(far.coverage.area_fetched, Some(false));
-    // The intersection of box and ball was fetched if either was.
+    assert_eq!(far.coverage.area_fetched, Some(true));
     let both = ask(&yard, |request, _| {
         request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 1.0]);
         request.region.ball = Some(Ball { centre_in_world: DVec3::new(20.0, 0.0, 0.0), radius: 0.105 });

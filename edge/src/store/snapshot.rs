@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 use slag_common::Hash32;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::shard::Profile;
 
 use super::cache::{BadCell, CellFault, Current, CurrentCell, EdgeCache, can_stand_in};
@@ -34,6 +34,15 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
+    /// Returns the cells without a shard on board.
+    pub fn not_fetched(&self) -> impl Iterator<Item = &CellRecord> {
+        let mut shards = self.shards.iter().map(|shard| shard.cell.cell_id).peekable();
+        self.manifest.cells.iter().filter(move |cell| {
+            while shards.next_if(|id| *id < cell.cell_id).is_some() {}
+            shards.peek() != Some(&cell.cell_id)
+        })
+    }
+
     /// Opens the current generation: maps and checks every shard once. One that does not open costs its cell only,
     /// and is marked for the next fetch.
     ///

@@ -10,7 +10,7 @@ use slag_common::objects::public_id;
 use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
 use slag_common::{Gaussians, durable, files, npy};
-use slag_models::words_to_find;
+use slag_models::one_to_find;
 
 use super::common;
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
@@ -71,7 +71,7 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
         return Err(anyhow!("--threshold is {threshold}, expected a cosine, -1 to 1"));
     }
     let mut encoder = text_encoder_of(&reader, &args.models)?;
-    let words = words_to_find(&args.text, encoder.known_phrases().map(|known| &**known))?;
+    let words = one_to_find(&args.text, encoder.known_phrases().map(|known| &**known))?;
     let asked_as = encoder.known_phrases().and_then(|known| known.asked_as(&words));
     let vector = encoder.encode(&words)?;
     let scores = match args.profile {

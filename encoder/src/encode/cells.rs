@@ -67,7 +67,7 @@ impl BuiltCells {
 /// Merges the contributions of the used views, builds all cells and puts their objects into the store.
 pub(super) fn build_cells(
     plan: &Plan<'_>,
-    views: &DoneViews<'_>,
+    views: &mut DoneViews<'_>,
     occupancy: Option<SceneOccupancy>,
     landmarks: Option<Vec<BuiltLandmarks>>,
 ) -> Result<BuiltCells, EncodeError> {
@@ -230,15 +230,20 @@ struct Opened {
 impl Opened {
     fn of(
         plan: &Plan<'_>,
-        views: &DoneViews<'_>,
+        views: &mut DoneViews<'_>,
         occupancy: Option<&SceneOccupancy>,
     ) -> Result<Self, EncodeError> {
         let (models, job, split) = (plan.engines.models, &plan.job, &plan.inputs.split);
         let bank = text_bank(plan);
         let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
-        let paths: Vec<PathBuf> = views.used.iter().map(|view| job.contributions_path(&view.name)).collect();
-        let (index, mut table) =
-            plan.context.time("merge", || ContributionIndex::open(&paths, models.dim(), &n_gaussians))?;
+        let open = |used: &[&View]| {
+            let paths: Vec<PathBuf> = used.iter().map(|view| job.contributions_path(&view.name)).collect();
+            plan.context.time("merge", || ContributionIndex::open(&paths, models.dim(), &n_gaussians))
+        };
+        let (mut index, mut table) = open(&views.used)?;
+        if views.leave_out_blind(&index) {
+            (index, table) = open(&views.used)?;
+        }
         let photo = |(view, n_masks): (&&View, usize)| -> Result<Photo, ContributionError> {
             let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
             Ok(Photo { name: view.name.clone(), outlines })

@@ -107,13 +107,13 @@ fn encode_into(
     let plan = plan::plan(settings, engines, &store, &inputs, &executor.rasterizer(engines), context)?;
     context.begin_phase(Phase::Views);
     plan.job.begin("views")?;
-    let views = views::run_views(&plan, executor)?;
+    let mut views = views::run_views(&plan, executor)?;
     let occupancy = views::look_around(&plan, &views)?;
     let landmarks = views::find_landmarks(&plan, &views)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
     let n_views = views.used.len();
-    let built = cells::build_cells(&plan, &views, occupancy, landmarks);
+    let built = cells::build_cells(&plan, &mut views, occupancy, landmarks);
     let built = built.map_err(|error| match error {
         EncodeError::Contributions(ContributionError::Cancelled) => {
             EncodeError::Interrupted { n_done: n_views, n_views }

@@ -12,7 +12,7 @@ use slag_models::ModelDir;
 use super::cells::{BuiltCells, FinishedCell};
 use super::error::EncodeError;
 use super::plan::Plan;
-use super::report::{CellReport, EncodeSummary, LeftOut};
+use super::report::{CellReport, EncodeSummary};
 use super::settings::Masks;
 use super::views::{DoneViews, Executor};
 use crate::ingest;
@@ -50,7 +50,6 @@ pub(super) fn publish(
     executor.begin_publication()?;
     plan.store.publish(&manifest, &built.extras)?;
     let mut summary = summary(&plan, &views, built, &manifest);
-    leave_out_blind(&mut summary);
     let context = plan.context;
     // With views left to do, contributions stay for the next encode.
     let has_open = views.records.len() + views.run.skipped.len() < plan.inputs.views.len();
@@ -183,21 +182,6 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         images_on: views.run.images_on.clone(),
         encoder: plan.engines.models.encoder_id().to_string(),
     }
-}
-
-/// Counts views as left out that have masks but see no Gaussian.
-fn leave_out_blind(summary: &mut EncodeSummary) {
-    let views = &summary.views;
-    let seen = views.view.iter().zip(&views.n_masks).zip(&views.n_entries);
-    let blind = seen.filter(|((_, n_masks), n_entries)| **n_masks > 0 && **n_entries == 0);
-    let mut left_out = LeftOut::default();
-    for ((view, _), _) in blind {
-        let reason = "it sees no Gaussian of the splat; correct its pose, or leave it out with --drop".into();
-        left_out.push(view.clone(), reason);
-    }
-    let blind = left_out.end();
-    summary.n_views -= blind.len();
-    summary.skipped_views.extend(blind);
 }
 
 fn cell_report((cell, n_entries): (&FinishedCell, &u64)) -> CellReport {

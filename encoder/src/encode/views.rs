@@ -17,6 +17,7 @@ use super::plan::Plan;
 use super::report::{GpuReport, LeftOut, SkippedView, StageReport};
 use super::view::{ViewRecord, ViewSink, ViewStages, Work};
 use crate::lanes::GpuLoad;
+use crate::lift::ContributionIndex;
 use crate::memory::Phase;
 use crate::occupancy::{self, OccupancyError, SceneOccupancy};
 use crate::{landmarks, shard};
@@ -32,6 +33,27 @@ pub(super) struct DoneViews<'a> {
     pub(super) coverage: Option<CoverageReport>,
     pub(super) run: ViewsRun,
     pub(super) secs: f64,
+}
+
+impl DoneViews<'_> {
+    /// Leaves out views that have masks but see no Gaussian, unless all are such; returns whether there are any.
+    pub(super) fn leave_out_blind(&mut self, index: &ContributionIndex) -> bool {
+        let is_blind: Vec<bool> =
+            index.views.iter().map(|view| view.n_masks > 0 && view.file.n_entries == 0).collect();
+        if !is_blind.contains(&true) || !is_blind.contains(&false) {
+            return false;
+        }
+        let mut left_out = LeftOut::default();
+        let blind = |(view, is_blind): (&&View, &bool)| is_blind.then(|| view.name.clone());
+        for name in self.used.iter().zip(&is_blind).filter_map(blind) {
+            let reason = "it sees no Gaussian of the splat; correct its pose, or leave it out with --drop";
+            left_out.push(name, reason.into());
+        }
+        self.skipped.extend(left_out.end());
+        let mut is_blind = is_blind.into_iter();
+        self.used.retain(|_| !is_blind.next().unwrap_or_default());
+        true
+    }
 }
 
 /// Takes the unfinished views through their stages.

@@ -31,9 +31,9 @@ impl From<ViewError> for Problem {
         let (status, kind, title) = match &error {
             ViewError::NoStore => (StatusCode::NOT_FOUND, "no-store", "No store"),
             ViewError::NoCell { .. } => (StatusCode::NOT_FOUND, "no-such-cell", "No such cell"),
-            ViewError::Text(InferenceError::EmptyText | InferenceError::SeveralThings(_)) => {
-                (StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter")
-            }
+            ViewError::Text(
+                InferenceError::EmptyText | InferenceError::SeveralThings(_) | InferenceError::Comparison(_),
+            ) => (StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter"),
             ViewError::Text(InferenceError::UnknownPhrase { .. } | InferenceError::UnknownWords { .. }) => {
                 (StatusCode::UNPROCESSABLE_ENTITY, "unknown-words", "Unknown words")
             }

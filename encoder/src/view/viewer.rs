@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use glam::{DQuat, DVec3, Vec3};
 use slag_common::{Hash32, View};
 use slag_models::names::words_of;
-use slag_models::{TextEncoder, words_to_find};
+use slag_models::{TextEncoder, one_to_find, words_to_find};
 use slag_view::{Description, Photo, Step, Words};
 
 use super::error::ViewError;
@@ -153,7 +153,7 @@ impl Viewer {
         self.with_text_encoder(|generation, OpenedText { encoder, .. }| {
             let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
             let known = encoder.known_phrases().cloned();
-            let vectors = texts.map(|text| encoder.encode(&words_to_find(text, known.as_deref())?));
+            let vectors = texts.map(|text| encoder.encode(&one_to_find(text, known.as_deref())?));
             let vectors = vectors.collect::<Result<Vec<_>, _>>()?;
             work(generation, &vectors)
         })
@@ -163,7 +163,7 @@ impl Viewer {
     pub(super) fn asked_as(&self, texts: &[String]) -> Result<BTreeMap<String, String>, ViewError> {
         self.with_text_encoder(|_, OpenedText { encoder, .. }| {
             let known = encoder.known_phrases();
-            let asked_as = |text: &String| known?.asked_as(&words_to_find(text, None).ok()?);
+            let asked_as = |text: &String| known?.asked_as(&words_to_find(text).ok()?);
             Ok(texts.iter().filter_map(|text| Some((text.clone(), asked_as(text)?))).collect())
         })
     }

@@ -26,6 +26,10 @@ pub(super) const SURE: f64 = 0.65;
 const TOUCHES_M: f64 = 0.05;
 /// As [`TOUCHES_M`], for a thing above another, such as the back of a chair above its seat.
 const ABOVE_M: f64 = 0.25;
+/// Objects of which the smaller has this share of the larger's volume are two, if one stands on the other.
+const STACKED: f64 = 0.5;
+/// Largest share of the lower one's height that they have in common.
+const STACKED_HEIGHT: f64 = 0.25;
 /// Default voxels in a metre of a metric scene; in others this many stand for a metre.
 const VOXELS_PER_METRE: f64 = 4.0;
 
@@ -40,6 +44,8 @@ pub struct Candidate<'a> {
     pub confidence: f64,
     /// Whether it has enough Gaussians in the region.
     pub is_inside: bool,
+    /// Volume of the piece that stands for it.
+    largest: f64,
 }
 
 #[derive(Clone)]
@@ -48,7 +54,25 @@ pub enum CandidateOf<'a> {
     Cluster(Cluster),
 }
 
-impl Candidate<'_> {
+impl<'a> Candidate<'a> {
+    /// Joins a piece to it. The largest piece stands for the whole, because the best may be a chair's leg.
+    fn join(&mut self, piece: Candidate<'a>) {
+        self.solid = self.solid.joined(&piece.solid);
+        self.is_inside |= piece.is_inside;
+        if piece.largest > self.largest {
+            (self.of, self.id, self.score) = (piece.of, piece.id, piece.score);
+            self.largest = piece.largest;
+        }
+    }
+
+    /// Whether two objects are a crate on a crate, not a back on its seat.
+    fn stands_on(&self, other: &Self) -> bool {
+        let are_objects = matches!((&self.of, &other.of), (CandidateOf::Object(_), CandidateOf::Object(_)));
+        let lower = self.solid.height().min(other.solid.height());
+        let are_alike = self.largest.min(other.largest) > STACKED * self.largest.max(other.largest);
+        are_objects && are_alike && self.solid.shared_height(&other.solid) < STACKED_HEIGHT * lower
+    }
+
     pub fn position_in_world(&self) -> DVec3 {
         match &self.of {
             CandidateOf::Object(found) => found.record.position(),
@@ -115,13 +139,17 @@ impl<'a> Things<'a> {
         let Some(best) = clusters.first().map(|best| best.score) else { return };
         (part.n_found, part.threshold, part.best_score) = (clusters.len(), threshold, Some(best));
         clusters.truncate(MAX_CANDIDATES);
-        let candidate = |cluster: Cluster| Candidate {
-            id: cluster.public_id(),
-            solid: Solid::of(&cluster.oriented_box, &cluster.extent.box_in_world),
-            score: cluster.score,
-            confidence: confidence(cluster.score, best, base),
-            is_inside: region.contains(cluster.extent.position_in_world),
-            of: CandidateOf::Cluster(cluster),
+        let candidate = |cluster: Cluster| {
+            let solid = Solid::of(&cluster.oriented_box, &cluster.extent.box_in_world);
+            Candidate {
+                id: cluster.public_id(),
+                solid,
+                score: cluster.score,
+                confidence: confidence(cluster.score, best, base),
+                is_inside: region.contains(cluster.extent.position_in_world),
+                largest: solid.volume(),
+                of: CandidateOf::Cluster(cluster),
+            }
         };
         *candidates = whole(clusters.into_iter().map(candidate), metre(scene.manifest));
     }
@@ -189,8 +217,10 @@ fn candidate<'a>(
     request: &QueryRequest,
 ) -> Candidate<'a> {
     let oriented = objects::oriented_box(scene, &found, &Region::default(), alignment(scene.manifest));
+    let solid = Solid::of(&oriented, &found.record.bounds());
     Candidate {
-        solid: Solid::of(&oriented, &found.record.bounds()),
+        solid,
+        largest: solid.volume(),
         score,
         confidence,
         is_inside: objects::in_region(scene, found.object, &request.region, request.min_count),
@@ -217,17 +247,16 @@ fn whole<'a>(candidates: impl IntoIterator<Item = Candidate<'a>>, metre: f64) ->
         let touches = |of: &Candidate<'_>| {
             let is_close = piece.solid.horizontal_gap(&of.solid) <= TOUCHES_M * metre
                 && -piece.solid.shared_height(&of.solid) <= ABOVE_M * metre;
-            is_close && piece.confidence >= SURE * of.confidence
+            is_close && !piece.stands_on(of) && piece.confidence >= SURE * of.confidence
         };
         let Some(first) = things.iter().position(touches) else {
             things.push(piece);
             continue;
         };
-        let mut whole = things[first].solid.joined(&piece.solid);
-        for other in things.extract_if(first + 1.., |of| touches(of)) {
-            whole = whole.joined(&other.solid);
+        let others: Vec<Candidate<'a>> = things.extract_if(first + 1.., |of| touches(of)).collect();
+        for piece in std::iter::once(piece).chain(others) {
+            things[first].join(piece);
         }
-        things[first].solid = whole;
     }
     things
 }

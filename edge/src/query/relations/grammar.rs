@@ -11,6 +11,7 @@
 //! near the window" is a mug on (a table near the window). Texts over [`MAX_TEXT_BYTES`] are no phrases, which bounds
 //! time and recursion.
 
+use slag_models::question::{ARTICLES, COMPARISONS, asked, starts, without_article};
 use slag_models::words;
 use slag_service::params::RequestError;
 
@@ -31,20 +32,12 @@ pub(super) const RELATIONS: [(Relation, &str); 11] = [
     (Relation::InFrontOf, "in front of, before"),
     (Relation::Behind, "in back of, behind, in the back of"),
 ];
-const PICKS: [(By, [&str; 2]); 4] = [
-    (By::Largest, ["largest", "biggest"]),
-    (By::Smallest, ["smallest", "littlest"]),
-    (By::Nearest, ["nearest", "closest"]),
-    (By::Farthest, ["farthest", "furthest"]),
-];
+/// As [`COMPARISONS`].
+const PICKS: [By; 4] = [By::Largest, By::Smallest, By::Nearest, By::Farthest];
 const NTH: [&str; 12] = [
     "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth",
     "eleventh", "twelfth",
 ];
-const ARTICLES: [&str; 4] = ["the", "a", "an", "my"];
-/// Words before the thing asked for, one after another.
-const OPENINGS: &str = "please, where is, where are, where's, find me, find, show me, go to, bring me, look for, \
-    take me to, is there, are there, any, all of, all";
 /// Words before a relation that ask for any thing.
 const ANY: [&str; 3] = ["what is", "what's", "what are"];
 const NEGATIONS: [&str; 4] = ["not", "isn't", "aren't", "never"];
@@ -67,7 +60,7 @@ pub fn understand(text: &str) -> Result<Option<Phrase>, RequestError> {
     }
     let words = words_of(text);
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    let words = &words[opening(&words)..];
+    let words = asked(&words);
     let any =
         ANY.iter().filter_map(|pattern| starts(words, pattern)).find(|n| relation(&words[*n..]).is_some());
     let words = any.map_or(words.to_vec(), |n| [&["thing"], &words[n..]].concat());
@@ -79,6 +72,12 @@ pub fn understand(text: &str) -> Result<Option<Phrase>, RequestError> {
 /// Refuses words that are not understood beside relations and comparisons.
 fn refuse(words: &[&str]) -> Result<(), RequestError> {
     let refused = |found: String, expected: String| Err(RequestError::new("text", &found, expected));
+    if let ["not", ..] = words {
+        return refused(
+            words.join(" "),
+            "what to look for; negatives name what must not be found".to_owned(),
+        );
+    }
     for at in 1..words.len() {
         let (here, after) = (words[at], &words[at + 1..]);
         let turns = EXCEPTIONS.contains(&here) || NEGATIONS.contains(&here) && relation(after).is_some();
@@ -126,22 +125,11 @@ fn refuse(words: &[&str]) -> Result<(), RequestError> {
     }
 }
 
-/// Returns the thing asked for ("sofa" for "Where is the sofa?"); `None` without words before a thing.
-pub fn asked_thing(text: &str) -> Option<String> {
-    let words = words_of(text);
-    let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    let thing = match opening(&words) {
-        0 => return None,
-        opening => without_article(&words[opening..]),
-    };
-    (!thing.is_empty()).then(|| thing.join(" "))
-}
-
 /// Returns a text's words in lower case without what stands before the thing: texts that ask the same are equal.
 pub fn normal(text: &str) -> String {
     let words = words_of(text);
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    without_article(&words[opening(&words)..]).join(" ")
+    without_article(asked(&words)).join(" ")
 }
 
 /// Returns the words of a text in lower case, and those of "on-the", which name no thing, apart.
@@ -158,17 +146,8 @@ fn words_of(text: &str) -> Vec<String> {
     words(&text.to_lowercase()).into_iter().flat_map(apart).collect()
 }
 
-/// Returns the number of words before the thing asked for.
-fn opening(words: &[&str]) -> usize {
-    let mut n = 0;
-    while let Some(more) = OPENINGS.split(", ").filter_map(|opening| starts(&words[n..], opening)).max() {
-        n += more;
-    }
-    n
-}
-
 fn picked(word: &str) -> Option<By> {
-    PICKS.iter().find(|(_, names)| names.contains(&word)).map(|(by, _)| *by)
+    COMPARISONS.iter().position(|names| names.contains(&word)).map(|at| PICKS[at])
 }
 
 /// Returns the words after "to" or "from", or those that begin with an article or are the asker.
@@ -180,22 +159,11 @@ fn origin<'a, 'b>(words: &'a [&'b str]) -> Option<&'a [&'b str]> {
     }
 }
 
-/// Returns the number of words of `pattern` if `words` begin with it.
-fn starts(words: &[&str], pattern: &str) -> Option<usize> {
-    let n = pattern.split(' ').count();
-    (words.len() >= n && pattern.split(' ').eq(words[..n].iter().copied())).then_some(n)
-}
-
 /// Returns the relation that begins here, and its number of words.
 fn relation(words: &[&str]) -> Option<(Relation, usize)> {
     let longest = |patterns: &str| patterns.split(", ").filter_map(|pattern| starts(words, pattern)).max();
     let here = RELATIONS.iter().filter_map(|(is, patterns)| Some((*is, longest(patterns)?)));
     here.max_by_key(|(_, n)| *n)
-}
-
-fn without_article<'a, 'b>(words: &'a [&'b str]) -> &'a [&'b str] {
-    let n_articles = words.iter().take_while(|word| ARTICLES.contains(word)).count();
-    &words[n_articles..]
 }
 
 /// Parses a phrase, or `None`. Each level of recursion names a thing.
@@ -321,6 +289,8 @@ mod tests {
             is_phrase(text);
         }
         same("are there any bottles on the table", "bottles on the table");
+        same("how many bottles are on the table?", "bottles on the table");
+        assert!(understand("not a bottle").is_err());
         same("all of the bottles on the table", "bottles on the table");
         same("what is on the table", "thing on the table");
         same("What\u{2019}s on the table?", "thing on the table");

@@ -9,6 +9,6 @@ mod rank;
 
 pub use candidates::{CandidateOf, ClustersOfThing, Found, Things, metre};
 pub use geometry::{HOLDS, Viewer};
-pub use grammar::{asked_thing, normal, understand};
+pub use grammar::{normal, understand};
 pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation, is_anything};
 pub use rank::{Related, Witness, relate};

@@ -142,7 +142,9 @@ impl<'b> Measure<'_, 'b> {
         if found.is_empty() {
             let and = others.map_or(String::new(), |(other, _)| format!(" and {}", quoted(&other.thing)));
             let (thing, of, is) = (quoted(&phrase.thing), quoted(&place.of.thing), place.is);
-            let detail = format!("{thing} and {of}{and} are on board, but no {thing} is {is} {of}{and}");
+            let limits = geometry::limits(is);
+            let detail =
+                format!("{thing} and {of}{and} are on board, but no {thing} is {is} {of}{and}{limits}");
             let miss = miss(ReasonKind::NoSuchPair, &phrase.thing, detail);
             return Err(Reason { best_degree: Some(best_degree), ..miss });
         }

@@ -172,6 +172,18 @@ const OFF_DEG: [f64; 2] = [30.0, 60.0];
 /// Distances of the outlines, metres: as [`OFF_DEG`]. A thing at the far end of a hall is not left of the door.
 const REACH_M: [f64; 2] = [3.0, 7.0];
 
+/// Returns the distances and angles up to which a relation holds, in words; empty where it has none of its own.
+pub fn limits(is: Relation) -> &'static str {
+    match is {
+        Relation::Near => " (within about 1 m)",
+        Relation::Beside => " (within 1 m, side by side)",
+        Relation::LeftOf | Relation::RightOf | Relation::InFrontOf | Relation::Behind => {
+            " (within 5 m and 45 degrees)"
+        }
+        _ => "",
+    }
+}
+
 /// The asker's pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Viewer {
