@@ -114,7 +114,7 @@ class Result:
     answers: Sequence[Answer]
     """The answers, best first."""
     area_fetched: Optional[bool] = None
-    """Whether the whole region asked for was fetched; absent without `radius` and `box`."""
+    """Whether all cells in the region asked for, or of the whole scene, are on board."""
     asked_as: Optional[Mapping[str, Any]] = None
     """What was asked in place of words that the model does not know."""
     bad_cells: Sequence[Mapping[str, Any]] = ()
@@ -124,6 +124,8 @@ class Result:
     is_exact: Optional[bool] = None
     """Whether exactly the Gaussians at or above the threshold match. Otherwise a Gaussian with a score within
     `score_error_bound` of the threshold may be misplaced."""
+    n_cells_not_fetched: Optional[int] = None
+    """Number of these cells that were not fetched."""
     n_matching: Optional[int] = None
     """Gaussians that match."""
     n_searched: Optional[int] = None
