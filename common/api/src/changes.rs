@@ -33,8 +33,8 @@ pub struct ChangesReply {
     pub n_same: usize,
     /// Things at the same place whose Gaussians changed, anywhere.
     pub n_stayed: usize,
-    /// Things that are not compared, anywhere: only one of the generations knows their place, or the splat there is the
-    /// same.
+    /// Things that are not compared, anywhere: only one of the generations knows their place, the splat there is the
+    /// same, or they are sparse pieces of things that both have.
     pub n_not_compared: usize,
     /// Things that are new.
     pub appeared: Vec<ChangedThing>,

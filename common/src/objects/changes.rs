@@ -1,7 +1,8 @@
 //! Which objects of two generations are the same.
 //!
 //! Matched first: equal Gaussians; then similar vectors and overlapping boxes, most overlap first; then, of the rest,
-//! similar vectors and equal size, nearest first. An object is matched once.
+//! similar vectors and equal size, nearest first. An object is matched once. The more equal two boxes are, the less
+//! their vectors need be: what stands around a thing, and the views that show it, change its vector, not its box.
 
 use std::collections::BTreeMap;
 
@@ -20,6 +21,16 @@ const STAYED_OVERLAP: f64 = 0.25;
 const MOVED_COSINE: f64 = 0.9;
 /// Largest ratio of the sorted box edges of an object that moved; sorted, because it may have turned.
 const MOVED_SIZE_RATIO: f64 = 1.5;
+/// Least intersection over union of boxes, and largest ratio of edges and of numbers of Gaussians, of one shape: other
+/// things have other shapes.
+const ONE_SHAPE_OVERLAP: f64 = 0.85;
+const ONE_SHAPE_RATIO: f64 = 1.1;
+/// Least cosines of an object of one shape, at the same place and at another.
+const ONE_SHAPE_STAYED_COSINE: f64 = 0.5;
+const ONE_SHAPE_MOVED_COSINE: f64 = 0.75;
+/// Most Gaussians of a sparse piece, in shares of those of the thing that it touches, and most of its density.
+const PIECE_SHARE: f64 = 0.05;
+const PIECE_DENSITY: f64 = 0.25;
 /// Boxes are widened on each side by this share of their diagonal, so that flat objects can overlap.
 const MARGIN: f64 = 0.05;
 /// Candidates kept for each earlier object, those of lowest cost: bounds memory where thousands are alike.
@@ -53,7 +64,8 @@ pub struct Changes {
     pub n_same: usize,
     /// At the same place with other Gaussians.
     pub n_stayed: usize,
-    /// In one list only, and not compared: the other does not know their place, or the splat there is unchanged.
+    /// In one list only, and not compared: the other does not know their place, the splat there is unchanged, or it is
+    /// a sparse piece of a thing that both have.
     pub n_not_compared: usize,
     /// In the later list only, by id.
     pub appeared: Vec<Thing>,
@@ -74,21 +86,27 @@ pub fn changes(
     old_tells: impl Fn(&Thing) -> bool,
 ) -> Changes {
     let is_in = |things: &[Thing], id: u64| things.binary_search_by_key(&id, |thing| thing.id).is_ok();
-    let n_same = new.iter().filter(|thing| is_in(&old, thing.id)).count();
+    let same: Vec<Thing> = new.iter().filter(|thing| is_in(&old, thing.id)).cloned().collect();
+    let n_same = same.len();
     let went: Vec<Thing> = old.iter().filter(|thing| !is_in(&new, thing.id)).cloned().collect();
     let appeared: Vec<Thing> = new.into_iter().filter(|thing| !is_in(&old, thing.id)).collect();
     let stayed = pairs(&went, &appeared, |old, new| {
         let overlap = overlap(&old.box_in_world, &new.box_in_world);
-        (overlap >= STAYED_OVERLAP && cosine(old, new) >= STAYED_COSINE).then_some(-overlap)
+        let is_one_shape = overlap >= ONE_SHAPE_OVERLAP && have_one_shape(old, new);
+        let least_cosine = if is_one_shape { ONE_SHAPE_STAYED_COSINE } else { STAYED_COSINE };
+        (overlap >= STAYED_OVERLAP && cosine(old, new) >= least_cosine).then_some(-overlap)
     });
+    let both: Vec<Thing> = stayed.iter().map(|(at_old, _)| went[*at_old].clone()).chain(same).collect();
     let [mut went, mut appeared] = without(went, appeared, &stayed);
     let n_rest = went.len() + appeared.len();
-    went.retain(new_tells);
-    appeared.retain(old_tells);
+    let is_piece = |thing: &Thing| both.iter().any(|of| is_sparse_piece(thing, of));
+    went.retain(|thing| new_tells(thing) && !is_piece(thing));
+    appeared.retain(|thing| old_tells(thing) && !is_piece(thing));
     let n_not_compared = n_rest - went.len() - appeared.len();
     let moved = pairs(&went, &appeared, |old, new| {
         let distance = old.position_in_world.distance(new.position_in_world);
-        (have_one_size(old, new) && cosine(old, new) >= MOVED_COSINE).then_some(distance)
+        let least_cosine = if have_one_shape(old, new) { ONE_SHAPE_MOVED_COSINE } else { MOVED_COSINE };
+        (edge_ratio(old, new) <= MOVED_SIZE_RATIO && cosine(old, new) >= least_cosine).then_some(distance)
     });
     let of_pair = |&(at_old, at_new): &(usize, usize)| {
         let (from, to) = (went[at_old].clone(), appeared[at_new].clone());
@@ -151,8 +169,26 @@ fn overlap(a: &Aabb, b: &Aabb) -> f64 {
     both / (volume(a.size()) + volume(b.size()) - both).max(f64::MIN_POSITIVE)
 }
 
-/// Returns whether the sorted edges of two boxes are alike.
-fn have_one_size(a: &Thing, b: &Thing) -> bool {
+/// Returns whether sizes and numbers of Gaussians are nearly equal.
+fn have_one_shape(a: &Thing, b: &Thing) -> bool {
+    let n = [a, b].map(|of| f64::from(of.n_gaussians));
+    edge_ratio(a, b) <= ONE_SHAPE_RATIO && n[0].max(n[1]) <= ONE_SHAPE_RATIO * n[0].min(n[1])
+}
+
+/// Returns whether one thing touches another and has few Gaussians beside it, thinly spread: a piece that the masks of
+/// one generation cut off, such as a leg. A small thing that stands on another is as dense.
+fn is_sparse_piece(piece: &Thing, of: &Thing) -> bool {
+    let density = |thing: &Thing| {
+        let [x, y, z] = thing.box_in_world.size().to_array();
+        f64::from(thing.n_gaussians) / (x * y + y * z + z * x).max(f64::MIN_POSITIVE)
+    };
+    f64::from(piece.n_gaussians) <= PIECE_SHARE * f64::from(of.n_gaussians)
+        && density(piece) <= PIECE_DENSITY * density(of)
+        && of.box_in_world.touches(&piece.box_in_world)
+}
+
+/// Returns the largest ratio of the sorted edges of two boxes.
+fn edge_ratio(a: &Thing, b: &Thing) -> f64 {
     let edges = |of: &Thing| {
         let size = of.box_in_world.size();
         // A flat thing's thickness is noise.
@@ -161,7 +197,8 @@ fn have_one_size(a: &Thing, b: &Thing) -> bool {
         edges.sort_by(f64::total_cmp);
         edges
     };
-    edges(a).iter().zip(edges(b)).all(|(a, b)| a.max(b) <= MOVED_SIZE_RATIO * a.min(b))
+    let ratio = |(a, b): (f64, f64)| a.max(b) / a.min(b).max(f64::MIN_POSITIVE);
+    edges(a).into_iter().zip(edges(b)).map(ratio).fold(1.0, f64::max)
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

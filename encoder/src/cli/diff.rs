@@ -115,7 +115,7 @@ fn lines(diff: &Diff) -> Result<String, fmt::Error> {
     if diff.n_not_compared > 0 {
         writeln!(
             lines,
-            "          {} are outlined in another way where the splat is the same",
+            "          {} are outlined in another way where the splat is the same, or sparse pieces of things that stayed",
             diff.n_not_compared
         )?;
     }

@@ -43,6 +43,46 @@ fn each_change_is_named() {
     assert_eq!((moved.from.id, moved.to.id, moved.distance), (3, 6, 5.0));
 }
 
+/// By hand: a brick pile whose vector changed with its neighbour, at its place and elsewhere; orthogonal vectors and
+/// other numbers of Gaussians are other things.
+#[test]
+fn things_of_one_shape_need_less_likeness() {
+    let brick = |id, x: f64, n_gaussians, vector| Thing {
+        n_gaussians,
+        ..thing(id, [x, 0.0, 0.0], [1.17, 0.95, 0.7], vector)
+    };
+    let (before, half) = (brick(1, 0.0, 5173, CHAIR), [0.6, 0.8]);
+    for (new, expected) in [
+        (brick(2, 0.0, 5036, half), (1, 0, 0)),
+        (brick(2, 0.01, 5036, half), (1, 0, 0)),
+        (brick(2, 0.0, 5036, TABLE), (0, 0, 1)),
+        (brick(2, 0.0, 2000, half), (0, 0, 1)),
+        (brick(2, 4.0, 5036, [0.8, 0.6]), (0, 1, 0)),
+        (brick(2, 4.0, 5036, half), (0, 0, 1)),
+        (brick(2, 4.0, 5036, TABLE), (0, 0, 1)),
+        (brick(2, 4.0, 2000, [0.8, 0.6]), (0, 0, 1)),
+    ] {
+        let found = all(vec![before.clone()], vec![new.clone()]);
+        assert_eq!((found.n_stayed, found.moved.len(), found.went.len()), expected, "{new:?}");
+    }
+}
+
+/// By hand: what masks cut off a thing that stayed, with few Gaussians for its size, is no thing of its own; a bottle on
+/// it, or the same elsewhere, is.
+#[test]
+fn sparse_pieces_are_not_compared() {
+    let of = |id, position, size, n_gaussians| Thing { n_gaussians, ..thing(id, position, size, CHAIR) };
+    let barrow = of(1, [0.0; 3], [1.2, 0.8, 0.3], 3400);
+    let leg = |x| of(2, [x, -0.3, -0.2], [0.6, 0.2, 0.3], 66);
+    let bottle = of(2, [0.0, 0.0, 0.3], [0.1, 0.1, 0.3], 160);
+    for (alone, expected) in [(leg(0.0), (1, 0)), (leg(3.0), (0, 1)), (bottle, (0, 1))] {
+        let (with, without) = (vec![barrow.clone(), alone], vec![barrow.clone()]);
+        let (went, appeared) = (all(with.clone(), without.clone()), all(without, with));
+        assert_eq!((went.n_not_compared, went.went.len()), expected, "{went:?}");
+        assert_eq!((appeared.n_not_compared, appeared.appeared.len()), expected, "{appeared:?}");
+    }
+}
+
 /// Of two similar objects, each matches the nearer place; one of another size matches neither.
 #[test]
 fn a_thing_is_matched_once_and_to_the_nearest() {
