@@ -78,7 +78,8 @@ pub struct ObjectPage {
 pub struct Name {
     /// The word.
     pub name: String,
-    /// The chance that it is right, as measured on labelled scenes; a thing may have several right names.
+    /// Its share among all names by their scores, 0 to 1: it orders names, and is no chance to be right. A thing may
+    /// have several right names.
     pub confidence: f64,
 }
 

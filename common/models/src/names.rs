@@ -1,4 +1,5 @@
-//! Names of objects: the words with the best scores, each with the chance that it is right.
+//! Names of objects: the words with the best scores, each with its share among all words. On scenes unlike those of
+//! the fit, a share is no chance: far fewer names are right.
 //!
 //! A score s is z = (s - mean) / spread above all scores of words and objects of a scene, which makes models
 //! comparable. The confidence of a word is a softmax over all words and "none of these": exp(a z) / (exp(a c) +

@@ -56,7 +56,7 @@ pub struct Listed {
 pub struct Thing {
     /// Its name within this generation.
     pub id: String,
-    /// What it is called, best first, each with the chance that this is right.
+    /// What it is called, best first, each with its share among names: it orders them, and is no chance to be right.
     pub names: Vec<Name>,
     /// Its middle, [x, y, z] in the world frame.
     pub position_in_world: [f64; 3],

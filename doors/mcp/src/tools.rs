@@ -20,8 +20,8 @@ use crate::stand::{Going, Stands};
 const INSTRUCTIONS: &str = "Answers where things are on the robot's map of its surroundings. All positions are in the \
     map's world frame and belong to the generation that the answer names. The map is a record of the past: things may \
     have moved since. Ask describe_place first if you do not know how large the map is, and list if you do not know what \
-    is there; ask find for each thing, and where_to_stand before going to one. Names in a list are guesses with their \
-    chances.";
+    is there; ask find for each thing, and where_to_stand before going to one. Names in a list are guesses, the \
+    likeliest first.";
 
 /// Which thing is shown.
 #[derive(Debug, Deserialize, JsonSchema)]

@@ -90,7 +90,7 @@ fn print_page(page: &ObjectPage) -> Result<(), Failure> {
         note(missing);
     }
     note(format_args!(
-        "{listed} of {n_objects} things on board of {}, generation {generation}; in per cent: the chance of a name",
+        "{listed} of {n_objects} things on board of {}, generation {generation}; in per cent: a share among names, no chance",
         visible(scene)
     ));
     let three = |p: DVec3, between: &str| format!("{:.2}{between}{:.2}{between}{:.2}", p.x, p.y, p.z);
