@@ -184,9 +184,13 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
     }
 }
 
+/// Mean error relative to the spread; one Gaussian, or equal ones, have none.
+fn relative_error(errors: &ScoreErrors) -> Option<f32> {
+    (errors.spread > f32::EPSILON).then(|| errors.mean / errors.spread)
+}
+
 fn cell_report((cell, n_entries): (&FinishedCell, &u64)) -> CellReport {
     let record = &cell.record;
-    let relative = |errors: &ScoreErrors| errors.mean / errors.spread.max(f32::MIN_POSITIVE);
     let shards = || record.shards.iter().map(|(profile, shard)| (profile.to_string(), shard));
     CellReport {
         cell_id: record.cell_id,
@@ -195,6 +199,19 @@ fn cell_report((cell, n_entries): (&FinishedCell, &u64)) -> CellReport {
         n_centroids: record.shards.values().map(|shard| shard.n_centroids).max().unwrap_or(0),
         n_subspaces: cell.n_subspaces,
         shard_bytes: shards().map(|(profile, shard)| (profile, shard.len_bytes)).collect(),
-        score_error: shards().map(|(profile, shard)| (profile, relative(&shard.score_errors))).collect(),
+        score_error: shards()
+            .filter_map(|(profile, shard)| Some((profile, relative_error(&shard.score_errors)?)))
+            .collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_gaussian_has_no_relative_error() {
+        let of = |mean, spread| relative_error(&ScoreErrors { mean, spread, ..ScoreErrors::default() });
+        assert_eq!([of(0.25, 0.5), of(0.25, 0.0), of(0.25, 1e-9)], [Some(0.5), None, None]);
     }
 }

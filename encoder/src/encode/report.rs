@@ -60,7 +60,7 @@ pub struct CellReport {
     /// Subspaces of the residual code, half a byte a Gaussian each; 0 where centroids suffice for every profile.
     pub n_subspaces: u32,
     pub shard_bytes: BTreeMap<String, u64>,
-    /// Mean error of their scores, relative to the spread of scores, by profile.
+    /// Mean error of their scores, relative to the spread of scores, by profile; absent where they do not differ.
     pub score_error: BTreeMap<String, f32>,
 }
 

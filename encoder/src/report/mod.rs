@@ -140,7 +140,8 @@ fn profiles(summary: &EncodeSummary, bytes: &Value) -> Vec<Vec<String>> {
         let n: f64 = errors().map(|(cell, _)| f64::from(cell.n_gaussians)).sum();
         let sum: f64 = errors().map(|(cell, error)| f64::from(cell.n_gaussians) * f64::from(error)).sum();
         let worst = errors().map(|(_, error)| error).fold(0.0, f32::max);
-        vec![profile.clone(), bytes.to_string(), format!("{:.4}", sum / n.max(1.0)), format!("{worst:.4}")]
+        let figure = |of: f64| if n > 0.0 { format!("{of:.4}") } else { "not known".into() };
+        vec![profile.clone(), bytes.to_string(), figure(sum / n), figure(worst.into())]
     };
     bytes.as_object().into_iter().flatten().map(row).collect()
 }
