@@ -7,16 +7,17 @@ use std::path::Path;
 use anyhow::Result;
 use glam::DVec3;
 use slag_common::frames::Aabb;
-use slag_common::manifest::CellRecord;
-use slag_common::shard::ShardHeader;
+use slag_math::stats::{Rank, quantile};
 
 use super::common::InputArgs;
 use crate::ingest::{Activated, FrameChoice};
 use crate::store::StoreReader;
 use crate::store::metadata::MetadataReader;
 
-/// Share of the Gaussians that the extent leaves out on each side of each axis: strays lie far away.
-const STRAY_SHARE: f64 = 0.02;
+/// Share of the Gaussians, in thousandths, that the extent leaves out on each side of each axis: strays lie far away.
+const STRAYS_PER_MILLE: usize = 10;
+/// Gaussians that are read for the extent; of larger scenes, every n-th.
+const MAX_READ: u64 = 1 << 20;
 /// Wider scenes are outdoors.
 const HOUSE_M: f64 = 25.0;
 const PORT: u16 = 7733;
@@ -27,7 +28,7 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
     let here = shell_word(store);
     // The page knows no --activated.
     let shown = if input.activated == Activated::default() { of_input(input) } else { String::new() };
-    let (extent, at) = extent_and_place(&boxes_of(&reader));
+    let (extent, at) = extent_and_place(&positions_of(&reader)?);
     let mut lines = String::from("\nnext\n");
     writeln!(lines, "  slag-encoder query --store {here} {}", example(&reader, extent))?;
     writeln!(lines, "  slag-encoder view --store {here}{shown}")?;
@@ -37,7 +38,7 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
 
 /// Lines for a robot, with the extent it can fetch. `url`: where the store is served.
 pub(super) fn of_robot(reader: &StoreReader, url: &str) -> Result<String> {
-    let (extent, at) = extent_and_place(&boxes_of(reader));
+    let (extent, at) = extent_and_place(&positions_of(reader)?);
     robot_lines(reader, url, extent, at)
 }
 
@@ -69,10 +70,20 @@ fn example(reader: &StoreReader, extent: Aabb) -> &'static str {
     if reader.manifest().geo_reference.is_some() && width_m > HOUSE_M { "car" } else { "chair" }
 }
 
-/// Each cell's box without the size of its Gaussians, with their number.
-fn boxes_of(reader: &StoreReader) -> Vec<(Aabb, f64)> {
-    let of = |cell: &CellRecord| (mean_box(reader, cell).unwrap_or(cell.bounds), f64::from(cell.n_gaussians));
-    reader.manifest().cells.iter().map(of).collect()
+/// Where Gaussians are, of all cells alike.
+fn positions_of(reader: &StoreReader) -> Result<Vec<DVec3>> {
+    let manifest = reader.manifest();
+    let every_nth = manifest.n_gaussians.div_ceil(MAX_READ).max(1) as usize;
+    let (mut positions, mut first) = (Vec::new(), 0);
+    for cell in &manifest.cells {
+        let Some(shard) = cell.shards.values().next() else { continue };
+        let shard = reader.read_shard(shard)?;
+        let (view, n) = (shard.view(), cell.n_gaussians as usize);
+        let read = (0..n).filter(|at| (first + at) % every_nth == 0);
+        positions.extend(read.map(|at| view.position_in_world(at)));
+        first += n;
+    }
+    Ok(positions)
 }
 
 pub(super) fn of_check(input: &InputArgs) -> String {
@@ -103,34 +114,19 @@ fn of_input(input: &InputArgs) -> String {
     paths.into_iter().filter_map(flag).collect()
 }
 
-/// Box around a cell's means, which ignores the size of large Gaussians, from the head of one of its shards; `None`
-/// where that cannot be read.
-fn mean_box(reader: &StoreReader, cell: &CellRecord) -> Option<Aabb> {
-    Some(ShardHeader::of_start(&reader.shard_head(cell)?)?.position_box())
-}
-
-/// Extent without strays, and the centre of the cell in the middle of the Gaussians. `boxes`: each cell's, with its
-/// number of Gaussians.
-fn extent_and_place(boxes: &[(Aabb, f64)]) -> (Aabb, DVec3) {
-    let total: f64 = boxes.iter().map(|(_, n)| n).sum();
-    // Coordinate below which a share of the Gaussians lies, each counted at its cell's side.
-    let quantile = |axis: usize, share: f64, side: fn(&Aabb) -> DVec3| {
-        let mut sides: Vec<(f64, f64)> = boxes.iter().map(|(of, n)| (side(of)[axis], *n)).collect();
-        sides.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let mut below = 0.0;
-        let found = sides.iter().find(|(_, n)| {
-            below += n;
-            below >= share * total
-        });
-        found.or(sides.last()).map_or(0.0, |(at, _)| *at)
+/// Extent without strays, and a place amid the Gaussians: the one nearest to the median along each axis.
+fn extent_and_place(positions: &[DVec3]) -> (Aabb, DVec3) {
+    let at = |per_mille: usize| {
+        let along = |axis: usize| {
+            let mut values: Vec<f64> = positions.iter().map(|position| position[axis]).collect();
+            quantile(&mut values, per_mille, Rank::Between).unwrap_or_default()
+        };
+        DVec3::from_array([0, 1, 2].map(along))
     };
-    let all = |share: f64, side: fn(&Aabb) -> DVec3| {
-        DVec3::from_array([0, 1, 2].map(|axis| quantile(axis, share, side)))
-    };
-    let extent = Aabb { min: all(STRAY_SHARE, |b| b.min), max: all(1.0 - STRAY_SHARE, |b| b.max) };
-    let middle = all(0.5, Aabb::centre);
-    let centres = boxes.iter().map(|(of, _)| of.centre());
-    let nearest = centres.min_by(|a, b| a.distance_squared(middle).total_cmp(&b.distance_squared(middle)));
+    let extent = Aabb { min: at(STRAYS_PER_MILLE), max: at(1000 - STRAYS_PER_MILLE) };
+    let middle = at(500);
+    let distance = |of: &DVec3| of.distance_squared(middle);
+    let nearest = positions.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
     (extent, nearest.unwrap_or(middle))
 }
 
@@ -161,13 +157,15 @@ mod tests {
     use super::*;
     use crate::cli::{Cli, Command};
 
-    /// By hand: two cells side by side, and a stray one far away with a hundredth of the Gaussians.
+    /// By hand: a row of 1,000 Gaussians, and a stray one far away, which widens its cell's box.
     #[test]
-    fn the_extent_is_that_of_most_cells() {
-        let cell = |x: f64, n| (Aabb { min: DVec3::new(x, 0.0, 0.0), max: DVec3::new(x + 2.0, 3.0, 1.0) }, n);
-        let (extent, at) = extent_and_place(&[cell(0.0, 500.0), cell(2.0, 480.0), cell(900.0, 9.0)]);
-        assert_eq!((extent.min, extent.max), (DVec3::ZERO, DVec3::new(4.0, 3.0, 1.0)));
-        assert_eq!(at, DVec3::new(1.0, 1.5, 0.5));
+    fn the_extent_is_that_of_most_gaussians() {
+        let mut positions: Vec<DVec3> = (0..1000).map(|x| DVec3::new(f64::from(x), 3.0, 1.0)).collect();
+        positions.push(DVec3::new(90_000.0, -50.0, 70.0));
+        let (extent, at) = extent_and_place(&positions);
+        assert_eq!((extent.min, extent.max), (DVec3::new(10.0, 3.0, 1.0), DVec3::new(990.0, 3.0, 1.0)));
+        assert_eq!(at, DVec3::new(500.0, 3.0, 1.0));
+        assert_eq!(extent_and_place(&[]).1, DVec3::ZERO);
     }
 
     /// The next command gets the same inputs.
