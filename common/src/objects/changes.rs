@@ -204,7 +204,7 @@ fn edge_ratio(a: &Thing, b: &Thing) -> f64 {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Thing {
     /// Derived from the indices of its Gaussians in the splat: equal while these are the same.
-    #[serde(serialize_with = "as_hex", deserialize_with = "from_hex")]
+    #[serde(serialize_with = "as_public", deserialize_with = "from_public")]
     pub id: u64,
     pub n_gaussians: u32,
     /// Mean of its Gaussians inside the box.
@@ -230,14 +230,15 @@ pub fn parse_public_id(text: &str) -> Option<u64> {
     is_hex.then(|| u64::from_str_radix(digits, 16).ok())?
 }
 
-fn as_hex<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+fn as_public<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
     // JSON numbers have 53 bits.
-    serializer.collect_str(&format_args!("{id:016x}"))
+    serializer.serialize_str(&public_id(*id))
 }
 
-fn from_hex<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error> {
+/// Records of earlier versions have the digits alone.
+fn from_public<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error> {
     let text = String::deserialize(deserializer)?;
-    u64::from_str_radix(&text, 16).map_err(de::Error::custom)
+    u64::from_str_radix(text.strip_prefix('o').unwrap_or(&text), 16).map_err(de::Error::custom)
 }
 
 impl Thing {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use anyhow::{Result, anyhow};
 use clap::Args;
 use slag_common::ByteSize;
-use slag_common::objects::Thing;
+use slag_common::objects::{Thing, public_id};
 
 use super::common::{Exit, print};
 use crate::diff::{self, Diff, Generation};
@@ -89,10 +89,8 @@ fn lines(diff: &Diff) -> Result<String, fmt::Error> {
     let place = |thing: &Thing| {
         let [[x, y, z], [w, d, h]] =
             [thing.position_in_world, thing.box_in_world.size()].map(|v| v.to_array());
-        let (id, n, photo) = (thing.id, thing.n_gaussians, &thing.photo);
-        format!(
-            "{id:016x} at {x:.2} {y:.2} {z:.2}, {w:.2} x {d:.2} x {h:.2}{unit}, {n} Gaussians, in {photo}"
-        )
+        let (id, n, photo) = (public_id(thing.id), thing.n_gaussians, &thing.photo);
+        format!("{id} at {x:.2} {y:.2} {z:.2}, {w:.2} x {d:.2} x {h:.2}{unit}, {n} Gaussians, in {photo}")
     };
     writeln!(lines, "generation {} to {}", diff.old_generation, diff.new_generation)?;
     for thing in &diff.appeared {

@@ -129,3 +129,16 @@ fn many_alike_things_are_all_matched() {
     assert!(found.moved.iter().all(|moved| moved.to.id == moved.from.id + 1000));
     assert!(found.moved.is_sorted_by_key(|moved| moved.from.id));
 }
+
+/// Ids are those of answers; records of earlier versions have their digits alone.
+#[test]
+fn ids_in_json_are_those_of_answers() {
+    let lamp = thing(0x2d8c, [0.0; 3], [1.0; 3], CHAIR);
+    let mut json = serde_json::to_value(&lamp).expect("numbers and text become JSON");
+    assert_eq!(json["id"], "o0000000000002d8c");
+    for id in ["o0000000000002d8c", "0000000000002d8c"] {
+        json["id"] = id.into();
+        let read: Thing = serde_json::from_value(json.clone()).expect("an id");
+        assert_eq!(read.id, lamp.id);
+    }
+}
