@@ -87,6 +87,8 @@ pub(super) struct Samples {
     indices: Vec<usize>,
     width_px: u32,
     views: Vec<CheckView>,
+    /// Name and focal length of the first view, px of its photo.
+    focal_of_first: Option<(String, f64)>,
     camera_positions: Vec<DVec3>,
 }
 
@@ -94,12 +96,13 @@ impl Samples {
     pub(super) fn new(n_views: usize, n_samples: usize, width_px: u32) -> Self {
         let n = n_samples.clamp(1, n_views);
         let indices = (0..n).map(|i| i * n_views / n).collect();
-        Self { indices, width_px, views: Vec::new(), camera_positions: Vec::new() }
+        Self { indices, width_px, views: Vec::new(), focal_of_first: None, camera_positions: Vec::new() }
     }
 
     /// Adds a view; its photo is copied only if it is a sample, or none before it tells anything.
     pub(super) fn add(&mut self, index: usize, view: &CheckView) -> Result<(), CheckError> {
         self.camera_positions.push(view.view.camera_from_world.inverse().translation);
+        self.focal_of_first.get_or_insert_with(|| (view.name.clone(), view.view.intrinsics.focal_x_px));
         let is_sample = self.indices.binary_search(&index).is_ok() || self.views.is_empty();
         if is_sample || self.views.iter().all(CheckView::is_plain) && !view.is_plain() {
             self.views.push(at_width(view, self.width_px)?);
@@ -151,6 +154,14 @@ impl Samples {
             advice: Vec::new(),
         };
         diagnosis.advice = advice(&diagnosis, means);
+        if let (Some(Mistake::FocalScale(factor)), Some((name, focal_px))) =
+            (diagnosis.mistake, &self.focal_of_first)
+        {
+            diagnosis.advice.push(format!(
+                "{name} has a focal length of {focal_px:.1} px; expected about {:.1} px",
+                focal_px * factor
+            ));
+        }
         if !search.goes_on() {
             let what = "the search ended early: too many Gaussians lie at one place to draw all corrections";
             diagnosis.advice.push(what.into());
@@ -196,19 +207,22 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Tries what is suspected and what goes unnoticed; where drawings and photos differ, also common mistakes, frames
-    /// and a sweep of scales, until one explains the photos. Returns the best trials, those first that explain them; a
-    /// frame of nerfstudio's defaults or a scale is refined if it is the first.
+    /// Tries what is suspected, what goes unnoticed and focal lengths; where drawings and photos differ, also common
+    /// mistakes, frames and a sweep of scales, until one explains the photos. Returns the best trials, those first that
+    /// explain them; a focal length, a frame of nerfstudio's defaults or a scale is refined if it is the first.
     fn run(&self, frames: &[FrameCandidate], fit: bool) -> Result<Vec<Trial>, CheckError> {
         let mut tried = Vec::new();
         let harmonics = (self.scene.sh_degree > 0).then_some(Mistake::Harmonics);
         let first = self.suspected.iter().copied().chain(harmonics).chain(Mistake::UNNOTICED);
         self.try_all(first, &mut tried)?;
-        if !fit && !tried.iter().any(|trial| self.explains(trial)) {
+        if !tried.iter().any(|trial| self.settles(trial)) {
+            self.try_all(Mistake::focal_lengths(), &mut tried)?;
+        }
+        if !fit && !tried.iter().any(|trial| self.settles(trial)) {
             let frames = frames.iter().map(|frame| Mistake::Frame(*frame));
             self.try_all(Mistake::common().into_iter().chain(frames), &mut tried)?;
         }
-        if !fit && !tried.iter().any(|trial| self.explains(trial)) {
+        if !fit && !tried.iter().any(|trial| self.settles(trial)) {
             let n = (SWEEP_LIMIT.ln() / SWEEP_STEP.ln()).floor() as i32;
             let powers = (-n..=n).filter(|power| *power != 0);
             self.try_all(powers.map(|power| Mistake::SceneScale(SWEEP_STEP.powi(power))), &mut tried)?;
@@ -260,12 +274,24 @@ impl Search<'_> {
         trial.psnr_db > (uncorrected_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
     }
 
+    /// Of mistakes that leave drawings somewhat like their photos, one may gain a little where another is the right
+    /// one: these end the search if the drawings become much like their photos.
+    fn settles(&self, trial: &Trial) -> bool {
+        let is_slight = Mistake::UNNOTICED.contains(&trial.mistake)
+            || matches!(trial.mistake, Mistake::FocalScale(_)) && !self.suspected.contains(&trial.mistake);
+        self.explains(trial) && (!is_slight || trial.psnr_db >= ALIKE_DB)
+    }
+
     /// Refines a focal length, or a similarity that is swept or computed from other data than the trainer's (pattern
     /// search, Hooke and Jeeves 1961). Others are exact.
     fn refined(&self, best: Trial) -> Result<Trial, CheckError> {
         // Directions of the search, up and down: focal length or scale, then three rotations and three translations.
         let (n_directions, mut step, n_halvings, least_gain_db) = match best.mistake {
-            Mistake::FocalScale(_) => (2, FIRST_FOCAL_STEP, HALVINGS, REFINED_GAIN_DB),
+            Mistake::FocalScale(factor) => {
+                // Photos of half the size have exactly half the focal length.
+                let is_size = factor.log2().fract() == 0.0;
+                (2, FIRST_FOCAL_STEP, HALVINGS, if is_size { REFINED_GAIN_DB } else { 0.0 })
+            }
             Mistake::SceneScale(_) => (2, FIRST_STEP, HALVINGS + 2, 0.0),
             Mistake::Frame(FrameCandidate { cause: FrameCause::NerfstudioDefaults, .. }) => {
                 (14, FIRST_STEP, HALVINGS + 2, REFINED_GAIN_DB)

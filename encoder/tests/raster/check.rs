@@ -65,6 +65,33 @@ fn a_splat_without_a_sky_fits_its_photos() {
     assert!(run(&yard.gaussians, &views, &CheckOptions::default()).diagnosis.is_some());
 }
 
+/// Focal lengths of another camera or size: drawings are still somewhat like their photos.
+#[needs_shared]
+fn focal_lengths_near_the_right_one_are_found() {
+    let root = shared("scenes/house_a");
+    let scene = read_splat(&root);
+    let views = poses::read(&root.join("transforms.json"), None).unwrap().views;
+    let views: Vec<CheckView> = views.iter().step_by(19).map(|view| shrunk(photo(view), 240)).collect();
+    for factor in [0.9, 1.05, 1.1] {
+        let mut planted = views.clone();
+        for view in &mut planted {
+            view.view.intrinsics.focal_x_px *= factor;
+            view.view.intrinsics.focal_y_px *= factor;
+        }
+        let right_px = views[0].view.intrinsics.focal_x_px;
+        let diagnosis = run(&scene, &planted, &CheckOptions::default()).diagnosis.expect("a diagnosis");
+        let found = diagnosis.mistake;
+        let is_it = matches!(found, Some(Mistake::FocalScale(f)) if (f * factor - 1.0).abs() < 0.015);
+        assert!(is_it, "{factor}: {found:?}");
+        let said = diagnosis.advice.join("\n");
+        let words = if factor > 1.0 { "times too long" } else { "times too short" };
+        assert!(
+            said.contains(words) && said.contains(&format!("{:.1} px; expected about", right_px * factor)),
+            "{said}"
+        );
+    }
+}
+
 /// Plants each mistake as the inverse of its correction, written independently.
 #[needs_shared]
 fn planted_mistakes_are_diagnosed() {
