@@ -53,7 +53,7 @@ const FREEING_ROUNDS: usize = 4;
 /// Standard deviations by which the landmarks may contradict the stated focal length.
 const FOCAL_SIGMAS: f64 = 3.0;
 /// Squared Mahalanobis distance by which they may contradict its aspect and principal point.
-const MAX_LENS_DISTANCE: f64 = 200.0;
+const MAX_LENS_DISTANCE: f64 = 25.0;
 
 /// A photo with its camera; gravity and a prior where they are known.
 #[derive(Clone, Copy, Debug)]
