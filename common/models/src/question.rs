@@ -24,11 +24,7 @@ const ASKERS: [&str; 3] = ["me", "us", "you"];
 /// # Errors
 /// No word can name something.
 pub fn words_to_find(text: &str) -> Result<String, InferenceError> {
-    let all = words(text);
-    let words = match asked_thing(text) {
-        Some(thing) => words(&thing),
-        None => all,
-    };
+    let words = asked_thing(text).map_or_else(|| words(text), |thing| words(&thing));
     let is_nameless =
         |word: &String| NAMELESS.split_whitespace().any(|nameless| word.eq_ignore_ascii_case(nameless));
     match words.iter().all(is_nameless) {

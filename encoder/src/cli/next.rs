@@ -28,7 +28,7 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
     let here = shell_word(store);
     // The page knows no --activated.
     let shown = if input.activated == Activated::default() { of_input(input) } else { String::new() };
-    let (extent, at) = extent_and_place(&positions_of(&reader)?);
+    let (extent, at) = extent_and_place(&positions_of(&reader));
     let mut lines = String::from("\nnext\n");
     writeln!(lines, "  slag-encoder query --store {here} {}", example(&reader, extent))?;
     writeln!(lines, "  slag-encoder view --store {here}{shown}")?;
@@ -38,7 +38,7 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
 
 /// Lines for a robot, with the extent it can fetch. `url`: where the store is served.
 pub(super) fn of_robot(reader: &StoreReader, url: &str) -> Result<String> {
-    let (extent, at) = extent_and_place(&positions_of(reader)?);
+    let (extent, at) = extent_and_place(&positions_of(reader));
     robot_lines(reader, url, extent, at)
 }
 
@@ -70,20 +70,20 @@ fn example(reader: &StoreReader, extent: Aabb) -> &'static str {
     if reader.manifest().geo_reference.is_some() && width_m > HOUSE_M { "car" } else { "chair" }
 }
 
-/// Where Gaussians are, of all cells alike.
-fn positions_of(reader: &StoreReader) -> Result<Vec<DVec3>> {
+/// Where Gaussians are, of all cells alike whose shard can be read.
+fn positions_of(reader: &StoreReader) -> Vec<DVec3> {
     let manifest = reader.manifest();
     let every_nth = manifest.n_gaussians.div_ceil(MAX_READ).max(1) as usize;
     let (mut positions, mut first) = (Vec::new(), 0);
     for cell in &manifest.cells {
         let Some(shard) = cell.shards.values().next() else { continue };
-        let shard = reader.read_shard(shard)?;
+        let Ok(shard) = reader.read_shard(shard) else { continue };
         let (view, n) = (shard.view(), cell.n_gaussians as usize);
         let read = (0..n).filter(|at| (first + at) % every_nth == 0);
         positions.extend(read.map(|at| view.position_in_world(at)));
         first += n;
     }
-    Ok(positions)
+    positions
 }
 
 pub(super) fn of_check(input: &InputArgs) -> String {
