@@ -447,8 +447,8 @@ impl Search<'_> {
         Some(fit)
     }
 
-    /// Returns the fit from the pose with most inliers at other focal lengths, as [`Self::freed_focal`] does. `than`: the fit
-    /// that it must exceed.
+    /// Returns the fit from the pose with most inliers at other focal lengths, as [`Self::freed_focal`] does. `than`:
+    /// the fit that it must exceed.
     fn zoomed(&self, than: &Fit) -> Option<(Fit, f64)> {
         let is_inlier = |one: &&Match| than.camera.error(&than.camera_from_world, one) < INLIER_PX;
         let share = self.all.iter().filter(is_inlier).count() as f64 / self.all.len() as f64;

@@ -26,8 +26,8 @@ const MAP_FOCAL_SIGMA: f64 = 0.005;
 /// Number of matches that count as one, because errors of neighbouring landmarks are alike: on 48 photos of the labelled
 /// house, positions are 2.5 times as far off as independent matches would suggest.
 const ALIKE: f64 = 6.0;
-/// Standard deviations of what is known of a lens before the photo is seen: of the logarithm of its vertical focal
-/// length's ratio to the horizontal one, and of its principal point as a share of the horizontal one.
+/// How well a lens is known before the photo is seen, as standard deviations: of the logarithm of the ratio of its
+/// vertical to its horizontal focal length, and of its principal point, as a share of the stated x coordinate.
 const ASPECT_SIGMA: f64 = 0.01;
 const CENTRE_SIGMA: f64 = 0.02;
 /// Median length of a normal vector of two components, in standard deviations: sqrt(2 ln 2).
@@ -115,9 +115,9 @@ fn normal_equations<const N: usize>(
         let lens = [[spread.x, 0.0, 1.0, 0.0], [spread.y, spread.y, 0.0, 1.0]];
         for (row, error, lens) in [(rows[0], error.x, lens[0]), (rows[1], error.y, lens[1])] {
             let turned = p.cross(row);
-            let j = [turned.to_array(), row.to_array()].concat();
+            let [focal, aspect, centre_x, centre_y] = lens;
             let j: [f64; POSE_AND_LENS] =
-                std::array::from_fn(|at| if at < POSE { j[at] } else { lens[at - POSE] });
+                [turned.x, turned.y, turned.z, row.x, row.y, row.z, focal, aspect, centre_x, centre_y];
             for a in 0..N {
                 of.vector[a] += weight * j[a] * error;
                 for b in 0..N {
@@ -153,8 +153,8 @@ fn inverse<const N: usize>(mut m: [[f64; N]; N]) -> Option<[[f64; N]; N]> {
     Some(out)
 }
 
-/// Refines a pose, with [`POSE_AND_FOCAL`] or [`POSE_AND_LENS`] the camera too, by least squares; errors above `soft_px` count less
-/// (Cauchy).
+/// Refines a pose by least squares, and the camera too with [`POSE_AND_FOCAL`] or [`POSE_AND_LENS`]; errors above
+/// `soft_px` count less (Cauchy).
 pub(crate) fn refine<const N: usize>(
     camera: &Pinhole,
     pose: &DAffine3,

@@ -57,7 +57,7 @@ pub fn asked_thing(text: &str) -> Option<String> {
     (asked.len() < words.len()).then(|| without_article(asked).join(" "))
 }
 
-/// Returns the words of a question without those before and behind what it asks for.
+/// Returns the words for what a question asks for, without its opening and ending.
 pub fn asked<'a, 'b>(mut words: &'a [&'b str]) -> &'a [&'b str] {
     while let Some(n) = OPENINGS.split(", ").filter_map(|opening| starts(words, opening)).max() {
         words = &words[n..];

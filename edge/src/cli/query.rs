@@ -169,10 +169,10 @@ fn notes(answers: &Answers) -> String {
             });
             format!("on board: {}", parts.collect::<Vec<_>>().join(", "))
         }
-        (None, AnswerKind::Objects) => format!(
-            "objects with {n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}"
-        ),
-        _ => format!("{n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}"),
+        (None, kind) => {
+            let of = if kind == AnswerKind::Objects { "objects with " } else { "" };
+            format!("{of}{n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}")
+        }
     };
     let mut notes = format!("{counted}\n");
     if let Some(missing) = answers.coverage.missing() {

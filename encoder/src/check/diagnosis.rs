@@ -207,9 +207,9 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Tries what is suspected, what goes unnoticed and focal lengths; where drawings and photos differ, also common
-    /// mistakes, frames and a sweep of scales, until one explains the photos. Returns the best trials, those first that
-    /// explain them; a focal length, a frame of nerfstudio's defaults or a scale is refined if it is the first.
+    /// Tries suspected mistakes, those that are easily overlooked, and focal lengths. If drawings and photos differ,
+    /// also common mistakes, frames and a sweep of scales, until one explains the photos. Returns the best trials,
+    /// those first that explain them; a focal length, a frame of nerfstudio's defaults or a scale is refined if it is the first.
     fn run(&self, frames: &[FrameCandidate], fit: bool) -> Result<Vec<Trial>, CheckError> {
         let mut tried = Vec::new();
         let harmonics = (self.scene.sh_degree > 0).then_some(Mistake::Harmonics);

@@ -70,7 +70,7 @@ fn example(reader: &StoreReader, extent: Aabb) -> &'static str {
     if reader.manifest().geo_reference.is_some() && width_m > HOUSE_M { "car" } else { "chair" }
 }
 
-/// Where Gaussians are, of all cells alike whose shard can be read.
+/// Positions of Gaussians, evenly from all cells; a shard that cannot be read is left out.
 fn positions_of(reader: &StoreReader) -> Vec<DVec3> {
     let manifest = reader.manifest();
     let every_nth = manifest.n_gaussians.div_ceil(MAX_READ).max(1) as usize;

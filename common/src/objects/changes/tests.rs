@@ -43,8 +43,8 @@ fn each_change_is_named() {
     assert_eq!((moved.from.id, moved.to.id, moved.distance), (3, 6, 5.0));
 }
 
-/// By hand: a brick pile whose vector changed with its neighbour, at its place and elsewhere; orthogonal vectors and
-/// other numbers of Gaussians are other things.
+/// By hand: a brick pile that stayed or moved, with another vector because its neighbour changed, is still the same
+/// thing; orthogonal vectors or another number of Gaussians make it another.
 #[test]
 fn things_of_one_shape_need_less_likeness() {
     let brick = |id, x: f64, n_gaussians, vector| Thing {

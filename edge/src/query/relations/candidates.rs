@@ -26,7 +26,7 @@ pub(super) const SURE: f64 = 0.65;
 const TOUCHES_M: f64 = 0.05;
 /// As [`TOUCHES_M`], for a thing above another, such as the back of a chair above its seat.
 const ABOVE_M: f64 = 0.25;
-/// Objects of which the smaller has this share of the larger's volume are two, if one stands on the other.
+/// Two stacked objects are separate things if the smaller has more than this share of the larger one's volume.
 const STACKED: f64 = 0.5;
 /// Largest share of the lower one's height that they have in common.
 const STACKED_HEIGHT: f64 = 0.25;
